@@ -1,4 +1,4 @@
-"""Tries the first steps of a user of the installed package. `scripts/wheel` removes compilers from PATH.
+"""Tries a new user's first steps with the installed package. `scripts/wheel` removes compilers from PATH.
 
 Runs the example of docs/environments/wildfire.md, which needs Pillow.
 """
@@ -35,21 +35,21 @@ def output(*command: str) -> str:
 
 
 def check_place() -> None:
-    """PATH has no compiler, and the imported package is the installed one."""
+    """Checks that PATH has no compiler, and that the imported package is the installed one."""
     for name in ("cargo", "rustc", "cc", "gcc", "clang"):
         assert shutil.which(name) is None, f"{name} is on the PATH"
     assert Path(emberwatch.__file__).is_relative_to(sys.prefix), emberwatch.__file__
 
 
 def check_versions() -> None:
-    """Package and programs have the same version."""
+    """Checks that the package and the programs have the same version."""
     version = output(sys.executable, "-m", "emberwatch", "--version").split()[-1]
     for name in PROGRAMS:
         assert output(find(name), "--version").split() == [name, version]
 
 
 def check_example() -> None:
-    """The example of docs/environments/wildfire.md draws a picture."""
+    """Checks that the example of docs/environments/wildfire.md draws a picture."""
     page = (ROOT / "docs/environments/wildfire.md").read_text("utf-8")
     code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
     assert code is not None
@@ -58,7 +58,7 @@ def check_example() -> None:
 
 
 def check_vector() -> None:
-    """A vector environment steps many worlds."""
+    """Checks that a vector environment steps many worlds."""
     envs = gymnasium.make_vec("emberwatch/WildfireMoves-v0", num_envs=8)
     envs.reset(seed=1000)
     for _ in range(64):
@@ -68,14 +68,14 @@ def check_vector() -> None:
 
 
 def check_training() -> None:
-    """The agent learns a model for a few steps."""
+    """Checks that the agent learns a model for a few steps."""
     flags = "train --steps 64 --worlds 2 --height 32 --width 32 --burn-in 500 --out learned"
     output(find("emberwatch-agent"), *flags.split())
     assert Path("learned/checkpoint.safetensors").stat().st_size > 100
 
 
 def check_dashboard() -> None:
-    """The dashboard's page answers while a server runs."""
+    """Checks that the dashboard's page answers while a server runs."""
     instance = f"wheel-{os.getpid()}"
     server = subprocess.Popen([find("emberwatch-server"), f"--instance={instance}"])
     emberwatch.connect(instance, wait=30).close()

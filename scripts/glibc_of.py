@@ -1,4 +1,4 @@
-"""Prints the newest version of glibc that the files of a wheel require."""
+"""Prints the newest glibc version that a file in a wheel requires."""
 
 import re
 import sys

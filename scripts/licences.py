@@ -24,7 +24,7 @@ SOURCE = "registry+https://github.com/rust-lang/crates.io-index"
 
 
 def allowed(expression: str) -> bool:
-    """Returns whether an SPDX expression can be met. `/` is an older way to write OR."""
+    """Returns whether the allowed licences satisfy an SPDX expression. `/` is an older form of OR."""
     words = re.findall(r"[()]|AND|OR|[^\s()]+(?: WITH [^\s()]+)?", expression.replace("/", " OR "))
     operators = {"AND": "and", "OR": "or", "(": "(", ")": ")"}
     return bool(eval(" ".join(operators.get(word) or str(word in ALLOWED) for word in words)))

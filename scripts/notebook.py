@@ -1,6 +1,6 @@
-"""Runs a notebook's code, cell by cell: `notebook.py FILE` compares the outputs with the outputs in the file.
+"""Runs a notebook's code cell by cell. `notebook.py FILE` compares the outputs with those stored in the file.
 
-The code must write the same words, with any numbers, and draw pictures of the same size. `--write` stores the new
+The code must print the same text except for numbers, and draw pictures of the same size. `--write` stores the new
 outputs in the file. The package and Pillow must be installed.
 """
 
@@ -20,7 +20,7 @@ from PIL import Image
 
 
 def shown(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
-    """Runs a cell. Returns its printed text and the value of its last line, as notebooks store them."""
+    """Runs a cell. Returns the printed text and the value of the last line, in the form that notebooks store."""
     body = ast.parse(source).body
     last = body.pop() if body and isinstance(body[-1], ast.Expr) else None
     printed, value = io.StringIO(), None
@@ -38,7 +38,7 @@ def shown(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def data_of(value: Any) -> dict[str, Any]:
-    """Returns a value as notebooks store it: as a picture, or as text."""
+    """Returns a value in the form that notebooks store: as a picture, or as text."""
     if not isinstance(value, Image.Image):
         return {"text/plain": [repr(value)]}
     file = io.BytesIO()
@@ -48,7 +48,7 @@ def data_of(value: Any) -> dict[str, Any]:
 
 
 def words(outputs: list[dict[str, Any]]) -> str:
-    """Returns what is compared: texts without their numbers, and the sizes of pictures."""
+    """Returns the part of the outputs that is compared: texts without numbers, and sizes of pictures."""
     texts = list[str]()
     for output in outputs:
         data = output.get("data", {})

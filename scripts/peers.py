@@ -1,8 +1,8 @@
-"""The peers with which `scripts/bench` compares Emberwatch, measured in the same run.
+"""Measures the peers with which `scripts/bench` compares Emberwatch, in the same run.
 
 - Gymnasium's AsyncVectorEnv with shared memory, around a trivial environment with the same spaces (4 KiB of
-  observation, 64 integers of action): the cost of its process boundary.
-- The wildfire's transition, the known-model filter and the shooting planner, written in plain numpy.
+  observation, 64 integers of action). This measures the cost of the process boundary.
+- The wildfire model's transition, the known-model filter and the shooting planner, written in plain numpy.
 
 Prints medians with minimum and maximum over rounds. Needs gymnasium and numpy.
 """
@@ -18,7 +18,7 @@ N_MOVES = 64
 
 
 class Trivial(gymnasium.Env):
-    """The spaces of Emberwatch's environment without a simulation."""
+    """An environment with the spaces of Emberwatch's environment, but without a simulation."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (*SHAPE, 1), np.uint8)
     action_space = gymnasium.spaces.MultiDiscrete([4] * N_MOVES)

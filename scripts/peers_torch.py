@@ -1,12 +1,12 @@
-"""PyTorch on the same CPU: the peer of `agent/network/benches/network.rs`, measured in the same run.
+"""Measures PyTorch on the same CPU, as the peer of `agent/network/benches/network.rs` in the same run.
 
-Measures three networks with torch's own layers: the dynamic autoencoder of `agent/network/src/autoencoder.rs` (hidden size
+Measures three networks with torch's layers: the dynamic autoencoder of `agent/network/src/autoencoder.rs` (hidden size
 16, windows of 1,000 frames of 64 x 64 cells), a DQN, and the neural belief's network (updates on 16 grids). Uses two
-threads; single inputs and the neural belief are also measured with one. Everything is measured twice: with glibc's
-default allocator, and with an allocator that keeps its memory and uses huge pages.
+threads; single inputs and the neural belief are also measured with one thread. Everything is measured twice: with
+glibc's default allocator, and with an allocator that keeps its memory and uses huge pages.
 
 Prints medians with minimum and maximum over rounds, and the mean processor time, which is more reliable on a busy
-machine. Needs torch. Arguments select the measurements whose names contain one of them.
+machine. Needs torch. Arguments select the measurements: a name must contain one of the arguments.
 """
 
 import os
@@ -25,7 +25,7 @@ N_VISITED = 33
 N_THREADS = 2
 DQN_INPUTS, DQN_ACTIONS, DQN_BATCH, DQN_REPLAY = 16, 4, 64, 1000
 
-# glibc reads these at start, so each setting runs in its own process.
+# glibc reads these settings only at start, so each setting runs in its own process.
 AS_IS = {}
 TUNED = {
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
@@ -41,7 +41,7 @@ def conv(before, after, stride=1, dilation=1):
 
 
 class UNet(nn.Module):
-    """Maps features of cells to the logits of the next observations there."""
+    """Maps features of cells to the logits of the cells' next observations."""
 
     def __init__(self):
         super().__init__()
@@ -114,7 +114,7 @@ def frames(share):
 def autoencoder_update(share):
     network, (seen, visited) = Autoencoder(), frames(share)
     optimiser = torch.optim.Adam(network.parameters(), 1e-3, betas=(0.5, 0.9))
-    # Computes the loss only in visited cells, as a careful user of torch would.
+    # Computes the loss only in visited cells, as careful torch code would.
     step, row, col = visited[1:].nonzero(as_tuple=True)
     goal = seen[1:][step, :, row, col]
 

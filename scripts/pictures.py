@@ -1,8 +1,8 @@
-"""Draws the pictures of the environments' pages, docs/environments/*.png.
+"""Draws the pictures on the environments' pages, docs/environments/*.png.
 
 The package and Pillow must be installed.
 
-The picture of Wildfire is the one that the example on its page draws.
+For Wildfire, this is the picture that the example on its page draws.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def wildfire() -> None:
 
 
 def moves() -> None:
-    """Draws the last path, and part of the next path."""
+    """Draws the last path, and a part of the next path."""
     parts = ("belief", "robot")
     env = gymnasium.make("emberwatch/WildfireMoves-v0", observation=parts, **SMALL, **SHOWN)
     seen, _ = env.reset(seed=1000)
@@ -57,7 +57,7 @@ def moves() -> None:
 
 
 def objective() -> None:
-    """Draws a path that the agent planned for fire."""
+    """Draws a path that the agent planned to find fire."""
     env = gymnasium.make("emberwatch/WildfireObjective-v1", **SMALL, **SHOWN)
     env.reset(seed=1000)
     for _ in range(30):
@@ -67,7 +67,7 @@ def objective() -> None:
 
 
 def team() -> None:
-    """Draws four robots, each of which plans on its own belief."""
+    """Draws four robots. Each robot plans on its own belief."""
     env = emberwatch.parallel_env(
         robots=4, action="path", observation=("belief", "robot"), start="random", **SMALL, **SHOWN
     )

@@ -16,7 +16,7 @@ from proselint.registry import CheckRegistry
 from proselint.registry.checks import Check, types
 from proselint.tools import LintFile
 
-#: Phrases to avoid, as regular expressions in which a space matches any white space; and what to write instead.
+#: Phrases to avoid, and what to write instead. Phrases are regular expressions; a space matches any white space.
 PHRASES = {
     "name the thing": r"\b(those|that) (of|who|which) (a|an|the|which)\b|\bof which\b|\bof such\b|\bsuch a one\b",
     "use a noun instead of a clause": r"\bwhat [a-z]+ (has|have|needs?|gives?|knows?)\b|\bas one of\b",
@@ -27,7 +27,7 @@ PHRASES = {
     "write instead of": r"\bin the place of\b",
     "say what applies instead": r"\bexpected none\b",
 }
-#: Checks of proselint on matters of taste; its lists of simple words; repeated words, which two headings may be.
+#: Disabled checks of proselint: matters of taste, lists of simple words, and repeated words, which headings can have.
 OFF = ("typography", "hyperbole", "weasel_words", "restricted", "lexical_illusions", "dates_times")
 OURS = [
     Check(
@@ -44,17 +44,17 @@ RUST = re.compile(r'"(?:[^"\\]|\\.)*"|//[/!]?(.*)')
 
 
 def blank(text: str) -> str:
-    """Replaces everything except line breaks by spaces, so that positions stay."""
+    """Replaces everything except line breaks with spaces, so that positions stay the same."""
     return re.sub(r"[^\n]", " ", text)
 
 
 def without_code(text: str) -> str:
-    """Blanks Markdown's code, tags and links."""
+    """Blanks the code, tags and links in Markdown."""
     return FENCE.sub(lambda match: blank(match[0]), text)
 
 
 def rust_comments(text: str) -> str:
-    """Returns the comments of a Rust file at their positions."""
+    """Returns the comments of a Rust file, at their original positions."""
     kept = list(blank(text))
     for match in RUST.finditer(text):
         if match[1] is not None:
@@ -63,7 +63,7 @@ def rust_comments(text: str) -> str:
 
 
 def python_comments(text: str) -> str:
-    """Returns the comments and docstrings of a Python file at their positions."""
+    """Returns the comments and docstrings of a Python file, at their original positions."""
     lines, kept = text.splitlines(keepends=True), list(blank(text))
     starts, before = [0], tokenize.NEWLINE
     for line in lines:
@@ -79,7 +79,7 @@ def python_comments(text: str) -> str:
 
 
 def hash_comments(text: str) -> str:
-    """Returns the comments of a shell or TOML file at their positions."""
+    """Returns the comments of a shell or TOML file, at their original positions."""
     return re.sub(r"^([^#\n]*)(#?)", lambda match: " " * len(match[0]), text, flags=re.MULTILINE)
 
 
@@ -93,10 +93,10 @@ TEXT_OF: dict[str, Callable[[str], str]] = {
 
 
 def faults(path: Path) -> Iterator[str]:
-    """Yields one line for each fault of a file."""
+    """Yields one line for each fault in a file."""
     text = TEXT_OF[path.suffix](path.read_text("utf-8"))
     file = LintFile(str(path), text)
-    # Comments are fragments with code between them, where many standard checks find faults that are none.
+    # Comments are fragments with code between them, in which many standard checks report false positives.
     checks = ALL_CHECKS if path.suffix == ".md" else OUR_CHECKS
     for fault in file.lint({**DEFAULT, "checks": checks}):
         found = " ".join(file.content[slice(*fault.check_result.span)].split())

@@ -1,4 +1,4 @@
-"""Tests the search of the built documentation site, opened from files: `search_site.py FOLDER`.
+"""Tests the search of the built documentation site, without a web server: `search_site.py FOLDER`.
 
 Needs Chromium.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from playwright.sync_api import Page, TimeoutError, sync_playwright
 
-#: A page to search from, the words, and a page that the search must find.
+#: A page to search from, the search words, and a page that the search must find.
 SEARCHES = (
     ("index.html", "attaching and swapping", "attaching.html"),
     ("environments/wildfire.html", "autoreset", "environments/moves.html"),
@@ -26,7 +26,7 @@ def finds(page: Page, words: str, expected: str) -> bool:
     box = page.get_by_role("textbox", name="Search")
     link = page.locator(f".md-search-result__link[href*='{expected}']").first
     box.click()
-    # The page ignores input before it has loaded its index.
+    # The page ignores input until it has loaded its index.
     for _ in range(15):
         box.fill("")
         box.press_sequentially(words, delay=50)
@@ -37,9 +37,9 @@ def finds(page: Page, words: str, expected: str) -> bool:
 
 
 def main() -> None:
-    """Searches from each page."""
+    """Runs each search from its page."""
     site = Path(sys.argv[1]).resolve()
-    # A root user's browser, as in containers, has no sandbox.
+    # Chromium cannot use its sandbox as root, for example in containers.
     flags = ["--no-sandbox"] if os.geteuid() == 0 else []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(

@@ -17,7 +17,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: Documents outside `docs`, and their pages.
+#: Documents outside `docs`, with the pages that they become.
 OUTSIDE = {
     "README.md": "index.md",
     "ARCHITECTURE.md": "architecture.md",
@@ -30,10 +30,10 @@ OUTSIDE = {
     "config/landscapes/jacksboro/README.md": "jacksboro.md",
 }
 
-#: An index for readers of the repository, which the site's navigation replaces.
+#: An index for readers of the repository. The site has a navigation instead.
 LEFT_OUT = {"docs/README.md"}
 
-#: A paragraph of the first page that is only for readers of the repository.
+#: A paragraph of the first page that addresses only readers of the repository.
 OF_REPOSITORY = re.compile(r"^All documents: .*?\n\n", re.MULTILINE | re.DOTALL)
 
 #: Hides the list of pages at the side of the home page.
@@ -43,16 +43,16 @@ HOME = "---\nhide: [navigation]\n---\n\n"
 API = "\n\n---\n\nAPI: [Python]({0}reference.md), [Rust]({0}rust.md)\n"
 
 FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
-#: The opening of a fence: its language, and further words that are only for tests.
+#: The opening of a code fence: its language, and further words that only tests use.
 INFO = re.compile(r"\A(```\w+)[^\n]*")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?![a-z]+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 NAMED = re.compile(r"(?<!\[)`([\w./-]+\.md)`")
-#: The space before a number's error or interval, at which lines must not break.
+#: The space before a number's error or interval, where lines must not break.
 SPREAD = re.compile(r"(?<=\d)( ± (?=\d)| \[-?[\d.]+, -?[\d.]+\])")
 
 
 def pages() -> dict[str, str]:
-    """Returns the path on the site of each file, by its path in the repository."""
+    """Returns a mapping from each file's path in the repository to its path on the site."""
     found = dict(OUTSIDE)
     for path in sorted((ROOT / "docs").rglob("*")):
         source = path.relative_to(ROOT).as_posix()
@@ -73,7 +73,7 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
         n_pictures += bool(mark)
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
         if path in found:
-            # All pictures but the first are loaded when they scroll into view.
+            # All pictures except the first are loaded when they scroll into view.
             later = "{loading=lazy}" if mark and n_pictures > 1 else ""
             shown = f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''}){later}"
             # A click opens a picture at full size, because its text is small on a phone.
@@ -100,7 +100,7 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
 
 
 def page_of(notebook: dict[str, Any], name: str) -> str:
-    """Converts a notebook to Markdown: texts, code, and the code's outputs below it."""
+    """Converts a notebook to Markdown: texts, and code with its outputs below."""
     parts = list[str]()
     for cell in notebook["cells"]:
         text = "".join(cell["source"])

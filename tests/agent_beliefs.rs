@@ -60,7 +60,7 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
     }
     let last = shown
         .last()
-        .expect("an observer that was there before the agent meets it");
+        .expect("an observer from before the agent connects to it");
     assert_eq!(last.header.step, 500);
     // The posterior is nearly certain of cells on the last path: a fire is observed as fire with probability 0.98.
     let surest = last.belief.iter().copied().fold(0.0, f32::max);
@@ -74,7 +74,7 @@ fn beliefs_that_nobody_looks_at_are_not_shown() {
     agent.until(|| server.step_of(0) > 100);
     let observer = Observer::agents(&server.instance).expect("observe");
     let header = until_all(&observer, 0..1)[0].header;
-    assert!(header.step > 100, "a belief of before");
+    assert!(header.step > 100, "a belief of an earlier step");
     let flown = (header.first_robot, header.n_robots);
     assert_eq!((header.pid, flown), (agent.pid(), (0, 1)));
 }

@@ -1,4 +1,4 @@
-//! `emberwatch-agent train` with the autoencoder: the paper's Algorithm 1 on small worlds.
+//! Tests of `emberwatch-agent train` with the autoencoder: the paper's Algorithm 1 on small worlds.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, on};
@@ -9,7 +9,7 @@ use tests::harness::{AGENT, Server, fly};
 /// A server with one small world.
 const WORLD: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 
-/// Settings with which both networks learn after a few steps.
+/// Settings with which both networks start to learn after a few steps.
 const SETTINGS: &str = "learner = \"autoencoder\"
 shooting_samples = 16
 [autoencoder]
@@ -116,7 +116,7 @@ fn a_checkpoint_keeps_hidden_vectors_goes_on_and_is_acted_on() {
         "expected a network for the world's grid, 7 x 9 | got one for 6 x 9",
     );
 
-    // A resume with another world starts a new episode, and drops rows newer than the checkpoint or cut short.
+    // Resuming with another world starts a new episode, and drops rows that are newer than the checkpoint or cut short.
     let metrics = place.folder.text("out/metrics.csv");
     let last = metrics
         .lines()
@@ -148,7 +148,7 @@ fn episodes_that_end_are_begun_again() {
     let rows = place.learn("out", &format!("{} --steps 30", on(&server)));
     assert!(!rows[29][LOSS].is_empty() && !rows[29][DQN_LOSS].is_empty());
     assert_eq!(server.step_of(0), 30 % 7);
-    // After an agent that stopped at the end of an episode, the world needs a reset before its next step.
+    // If an agent stops at the end of an episode, the world needs a reset before its next step.
     let mut client = server.acquire(0..1);
     for _ in 30 % 7..7 {
         fly(&mut client, vec![Move::Up; 5]);

@@ -1,4 +1,4 @@
-//! Wrong input to every command leads to an exit code and one line of error, never to a panic.
+//! Tests that invalid input to any command leads to an exit code and a one-line error, never to a panic.
 
 use emberwatch_learning::policy;
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use tests::harness::{AGENT, Ended, Folder, Program, SERVER, SMALL, Server, new_i
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
                     --policies coverage --baseline coverage";
 
-/// Flags of the server, and words of their refusal.
+/// Invalid flags of the server, and words of the resulting error.
 const WRONG_SERVER_FLAGS: &str = r#"
 --instance a/b => instance name | "a/b"
 --worlds 1025 => worlds: expected 1 to 1024, got 1025
@@ -34,7 +34,7 @@ status --instance nobody => no server on instance "nobody"
 stop --instance nobody => no server on instance "nobody"
 "#;
 
-/// Flags of the agent, and words of their refusal.
+/// Invalid flags of the agent, and words of the resulting error.
 const WRONG_AGENT_FLAGS: &str = r#"
 run --instance nobody --wait 0 => no server on instance "nobody"
 run --wait soon => --wait | expected a number of seconds
@@ -78,7 +78,7 @@ compare TINY --csv / => --csv: write /: expected a regular file, got a folder
 compare TINY --figures /proc => create /proc: expected a writable folder
 "#;
 
-/// Runs a program and checks that it refuses with one line that contains all words; ` | ` separates them.
+/// Runs a program and checks that it fails with a one-line error that contains all words, separated by ` | `.
 pub fn check(program: &str, arguments: &str, words: &str) {
     let Ended {
         code,

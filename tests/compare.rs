@@ -1,4 +1,4 @@
-//! `emberwatch-agent compare` from end to end: comparisons repeat bit for bit, also with a second model.
+//! End-to-end tests of `emberwatch-agent compare`: comparisons repeat bit for bit, also with a second model.
 
 use crate::commands::{TINY, agent, check};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
@@ -36,14 +36,14 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     let [csv, figures] = ["new/out.csv", "figures"].map(|name| folder.word(name));
     let ended = agent(&format!("{WHAT} {WORLDS} --csv {csv} --figures {figures}"));
     let rows = read_runs(&folder.path("new/out.csv")).expect("rows");
-    // The default comparison of the wildfire has fifteen policies, with two seeds each.
+    // The default comparison on the wildfire model has fifteen policies, with two seeds each.
     assert_eq!(rows.len(), 15 * 2, "{rows:?}");
     for pair in rows.as_chunks::<2>().0 {
         ended.check_prints(&pair[0].policy);
         for (run, of_first) in pair.iter().zip(&rows) {
             assert_eq!(run.policy, pair[0].policy);
             let world = |run: &PolicyRun| (run.world_seed, run.mean_fire_cells);
-            assert_eq!(world(run), world(of_first), "all met the same worlds");
+            assert_eq!(world(run), world(of_first), "all ran on the same worlds");
         }
     }
     for (name, words) in [

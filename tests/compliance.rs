@@ -1,5 +1,5 @@
-//! Guarantees of the protocol for every client: the handshake, echoes, and refusals that change nothing. The suite runs
-//! through the Rust crate and through `wire_reference.py`.
+//! Tests what the protocol guarantees to every client: the handshake, echoed request fields, and refusals that change
+//! nothing. The suite runs with the Rust client and with `wire_reference.py`.
 
 use crate::python::PythonWire;
 use emberwatch_protocol::Model;
@@ -22,7 +22,7 @@ const N_MOVES: u32 = 6;
 /// Number of cells of a world on a [`SMALL`] server.
 const N_CELLS: usize = 35;
 
-/// The implementation of the client.
+/// The client implementation that runs the suite.
 #[derive(Clone, Copy)]
 enum Client {
     Rust,
@@ -105,7 +105,7 @@ impl Table {
         }
     }
 
-    /// Returns everything that a refusal must not change: k, robots, holders, frames and results.
+    /// Returns everything that a refusal must leave unchanged: k, robots, holders, frames and results.
     fn everything(&self) -> (String, Vec<u8>) {
         let (reply, payload) = self.theirs.step(observe_header(0..6), &[]);
         assert_eq!(reply.status, Status::Ok as u32, "observing needs no lease");
@@ -256,7 +256,7 @@ fn a_damaged_or_outdated_step_changes_nothing(client: Client) {
     steps.check_body(second, &one, Incomplete, 0);
     let both = step_body(&[1, 0], &[0; 18]);
     steps.check_body(|h| h.n_robots = 3, &both, Incomplete, 3);
-    // All robots that the client holds, in several worlds; in one of them another client holds a robot.
+    // All robots that the client holds, in several worlds. In one of these worlds, another client holds a robot.
     let all = step_body(&[1, 0, 0], &[0; 30]);
     steps.check_body(|h| h.n_robots = 5, &all, Incomplete, 5);
     for (k, status) in [(0, Late), (2, Early), (u64::MAX, Early)] {
@@ -266,8 +266,8 @@ fn a_damaged_or_outdated_step_changes_nothing(client: Client) {
     steps.check_body(|h| h.n_robots = 4, &second, Early, 0);
 }
 
-/// Requests, the status and detail of their refusal, and words of its message. `OURS`, `THEIRS` and `ENDED` stand for
-/// leases, `US` and `THEM` for processes.
+/// Requests that are refused, each with the status, the detail and words of the refusal. `OURS`, `THEIRS` and `ENDED`
+/// stand for leases, `US` and `THEM` for processes.
 const REFUSED: &str = r#"
  => Malformed 0 malformed control message
 { => Malformed 0 malformed control message
@@ -374,7 +374,7 @@ fn a_step_answer_echoes_its_request_and_fits_its_payload(client: Client) {
 fn a_client_that_shuts_the_server_down_is_answered(client: Client) {
     let server = Server::start(SMALL);
     let wire = client.open(&server.instance);
-    // The memory of answers disappears with the server. This request makes the client map it before the server ends.
+    // The memory for answers disappears with the server. This request makes the client map it before the server ends.
     wire.ask(&Request::Status {});
     assert_eq!(wire.ask(&Request::Shutdown {}), Reply::Done);
     server.program.ends(0);

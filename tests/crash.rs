@@ -1,4 +1,4 @@
-//! Agents that are killed or stopped in the middle of a step. Their world must not change.
+//! Tests of agents that are killed or stopped in the middle of a step. Their world must not change.
 
 use emberwatch_protocol::channels::{ChannelError, Instance};
 use emberwatch_protocol::client::Claim;
@@ -33,13 +33,13 @@ fn a_killed_agents_world_is_free_and_unchanged() {
     let mut frames = frames_until(&observer, 0, 0);
     for _ in 0..3 {
         let next = Wire::open(&server.instance);
-        // No more steps than an observer's buffer holds, so that none is lost if it reads late.
+        // An observer's buffer has room for this many steps, so none is lost if it reads late.
         let agent = start_agent(&server.instance, "--steps 50");
         let at = frames[frames.len() - 1].header.result.step;
         frames.extend(frames_until(&observer, 0, at + 4));
         server.program.stop();
         agent.kill();
-        // This is the first request that the server finds when it resumes.
+        // When the server resumes, this is the first request that it receives.
         let text = serde_json::to_vec(&acquire_request(0..1)).expect("requests serialise");
         let pending = next.send_control(control_header(1), &text).expect("send");
         server.program.signal(Signal::CONT);

@@ -1,7 +1,8 @@
-//! Runs every decoder on the files of its corpus and on damaged copies of them. This is a separate test program,
+//! Runs every decoder on the files of its corpus and on damaged copies of these files. This is a separate test program,
 //! because it measures the memory of its process.
 //!
-//! Each decoder gets 40 * `PROPTEST_CASES` copies, by default 10,240. `fuzz/` fuzzes the decoders by coverage.
+//! Each decoder gets 40 * `PROPTEST_CASES` copies, by default 10,240. `fuzz/` has coverage-guided fuzzers of the same
+//! decoders.
 
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -22,19 +23,19 @@ const MAX_SECONDS: i64 = 1;
 /// Maximum growth of the process's peak memory over all inputs of a decoder, in KiB.
 const MAX_GROWTH: u64 = 64 << 10;
 
-/// Limits of lengths, counts and signs. Each number is also tried plus one and plus two.
+/// Integers at the limits of lengths, counts and signs. Each is also tried plus one and plus two.
 #[rustfmt::skip]
 const INTEGERS: [u64; 9] =
     [0, 7, 0x7f, 0xff, 0x7fff, 0xffff, 0x7fff_ffff, 0xffff_ffff, u64::MAX >> 1];
 
-/// Texts that are difficult for parsers of TOML, JSON and numbers.
+/// Tokens that are difficult for parsers of TOML, JSON and numbers.
 const WORDS: &str = r#"0 1 -1 -0.0 255 65536 4294967296 9007199254740993 9223372036854775807 18446744073709551615 1e400
     1e-400 1e308 1e100 1e30 1e-30 1e-320 nan -inf inf null true " \u0000 \ud800 """ { } [ ] [[ = , é"#;
 
-/// A change to a file. Its position counts modulo the number of positions in the file.
+/// A change to a file. Its position is taken modulo the number of positions in the file.
 #[derive(Debug, Clone)]
 enum Change {
-    /// Replaces a range of bytes by others.
+    /// Replaces a range of bytes with other bytes.
     Splice(usize, usize, Vec<u8>),
     /// Writes an integer of 1, 2, 4 or 8 bytes at a multiple of its length.
     Overwrite(usize, Vec<u8>),
@@ -103,7 +104,7 @@ fn decode(target: &Target, bytes: &[u8]) -> Result<bool, TestCaseError> {
 fn attack(target: &Target) {
     let name = target.name;
     let files = target.corpus().expect(name);
-    // Resets the peak. Where that is not allowed, the old peak stands, which is no smaller.
+    // Resets the peak. Where that is not allowed, the old peak remains, which is at least as large.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     let before = memory("VmHWM:", std::process::id());
     for file in &files {

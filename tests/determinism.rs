@@ -1,4 +1,4 @@
-//! A world is a function of model, seed and k. It does not depend on other worlds, threads, clients or observers.
+//! Tests that a world depends only on model, seed and k, and not on other worlds, threads, clients or observers.
 
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::observer::Observer;
@@ -12,10 +12,10 @@ const N_SEEDS: u32 = 8;
 /// Number of steps flown on each world.
 const N_STEPS: usize = 12;
 
-/// A grid so small that one thread steps a batch.
+/// A grid so small that a single thread steps a batch of worlds.
 const SMALL: &str = "--height 9 --width 14 --burn-in 200";
 
-/// 8 worlds of 128 x 128 cells: large enough that several threads step a batch.
+/// A grid so large that several threads step a batch of 8 worlds.
 const LARGE: &str = "--height 128 --width 128 --burn-in 3";
 
 /// The observations of a world, step by step.
@@ -78,7 +78,7 @@ fn worlds_do_not_depend_on_worlds_beside_them_observers_or_threads() {
         );
         assert!(
             trajectories[0] != trajectories[1],
-            "seeds tell worlds apart"
+            "worlds with different seeds differ"
         );
         assert!(trajectories == reference(size), "{size} {flags}");
         for observer in observers {

@@ -1,4 +1,4 @@
-//! Resets, ends of episodes, and coverage, as clients observe them.
+//! Tests of resets, ends of episodes, and coverage, as clients observe them.
 
 use crate::random_robot::fly_at_random;
 use emberwatch_protocol::control::{Reply, Request, WorldInfo, WorldSeed};

@@ -1,4 +1,4 @@
-//! Settings files and model files. Errors in wrong ones name the path and the entry; correct ones are accepted.
+//! Tests of settings and model files. Errors name the path and the invalid entry; valid files are accepted.
 
 use crate::commands::{TINY, check};
 use emberwatch_protocol::Model;
@@ -7,7 +7,7 @@ use tests::harness::{AGENT, Folder, SERVER, SMALL, Server, repository, run};
 #[test]
 fn wrong_files_are_refused_by_path_and_entry() {
     let folder = Folder::default();
-    // All weights of the kernel are on the cell above, which the top row lacks.
+    // The kernel has weight only on the cell above, which cells of the top row lack.
     let above = r##"
         name = "from-above"
         kernel_size = [3, 1]

@@ -1,4 +1,4 @@
-//! Observers: the content of `frames` and `truth`, who receives it, and that the server never waits for observers.
+//! Tests of the channels `frames` and `truth`: their content and receivers. The server must never wait for observers.
 
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use emberwatch_protocol::message::{FrameHeader, VERSION};

@@ -1,4 +1,4 @@
-//! The belief of an agent that takes over: the former agent's stored belief, or one computed from the kept frames.
+//! Tests of an agent that takes over: it starts from the former agent's stored belief, or from the kept frames.
 
 use emberwatch_agent::client::left_belief::{leave_belief, left_belief};
 use emberwatch_belief::estimation::belief::Belief;
@@ -14,10 +14,10 @@ use tests::wire::{RawClient, Wire, recall_header, step_body};
 const FLAGS: &str =
     "--model wildfire-small --height 16 --width 16 --moves 12 --burn-in 300 --seed 3";
 
-/// A history that keeps all frames of these tests.
+/// A history long enough for all frames of these tests.
 const ALL: &str = "--history 100000";
 
-/// The log line of an agent that must simulate its first belief.
+/// The line that an agent logs if it must simulate its first belief.
 const FIRST_BELIEF: &str = "simulating the first belief";
 
 fn run(server: &Server, flags: &str) -> Program {
@@ -29,14 +29,14 @@ fn ask(robot: u32) -> Request {
     Request::Belief { robot, offset: 0 }
 }
 
-/// Returns the paths flown up to step `last`, as far back as an observer's buffer reaches: more than 40.
+/// Returns the paths flown up to step `last`, as far back as an observer's buffer reaches: more than 40 steps.
 fn paths(observer: &Observer<FrameHeader>, last: u64) -> Vec<Vec<Move>> {
     let samples = frames_until(observer, 0, last);
     let flown = samples.iter().filter(|it| it.header.result.step > 0);
     flown.map(path_of).collect()
 }
 
-/// Returns the paths of an agent that flies undisturbed.
+/// Returns the paths of an agent that nobody takes over from.
 fn undisturbed(n_steps: u64, policy: &str) -> Vec<Vec<Move>> {
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
@@ -193,7 +193,7 @@ fn an_agent_told_to_stop_leaves_its_belief() {
     let Ok(Reply::Belief { info, .. }) = belief else {
         panic!("expected a belief, got {belief:?}");
     };
-    // Per cell three probabilities and the time of the last observation; then two rewards and a count.
+    // Each cell has three probabilities and the time of its last observation. Two rewards and a count follow.
     assert_eq!(info.length, (3 + 1) * 16 * 16 * 4 + 16);
     assert!(info.kind.starts_with("bayes_filter "), "{}", info.kind);
 }

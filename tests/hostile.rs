@@ -1,5 +1,5 @@
-//! Clients with the right message types and hostile content. Whatever they send, the server survives and the worlds of
-//! other clients continue undisturbed.
+//! Tests with clients that send hostile content in valid message types. The server must survive, and the worlds of
+//! other clients must continue undisturbed.
 //!
 //! `cargo test -p tests -- --ignored` sends a million messages.
 
@@ -22,7 +22,7 @@ fn attack(n_messages: u64) {
         let mut attacker = Attacker::new(&server.instance, stolen, 1);
         (0..n_messages).for_each(|_| attacker.strike());
         let (refused, accepted) = (attacker.n_refused, attacker.n_accepted);
-        assert!(refused > n_messages / 4, "{refused} refused: too tame");
+        assert!(refused > n_messages / 4, "{refused} refused: too harmless");
         assert!(
             accepted > n_messages / 100,
             "{accepted} accepted: not like a client"
@@ -103,11 +103,11 @@ fn requests_whose_answers_nobody_reads_disturb_nobody() {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
         for round in 0..1_000 {
-            // Only the first may be flown; all later ones are late.
+            // Only the first path may be flown; all later paths are late.
             let step = wire.send_step(second_robot(lease), &body(0)).expect("send");
             let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
             let refused = wire.send_step(second_robot(lease), &body(0));
-            assert!(refused.is_err(), "a client has one request under way");
+            assert!(refused.is_err(), "more than one pending request");
             drop((step, control.expect("send")));
         }
         assert!(server.step_of(1) <= 1, "a step was made twice");
@@ -205,7 +205,7 @@ fn old_leases_and_numbers_open_nothing_again() {
                 assert_eq!([status, renewed], [Status::LeaseLost; 2]);
             }
         }
-        // All three worlds with a lease on two of them, then the victim's world with this lease.
+        // Requests all three worlds with a lease on two of them, then the victim's world with the same lease.
         let lease = wire.acquire(1..3).lease;
         let all = StepRequest {
             n_robots: 3,

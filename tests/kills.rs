@@ -1,4 +1,4 @@
-//! Programs that are killed at any moment of their start or end. Their remains must not block later programs.
+//! Tests of programs that are killed at any moment while they start or end. Leftovers must not block later programs.
 
 use emberwatch_protocol::channels::{Instance, SHARED_MEMORY};
 use rand::RngExt;
@@ -17,13 +17,13 @@ use tests::meter::all_under;
 /// A small server that is ready immediately.
 const FLAGS: &str = "--burn-in 0 --height 8 --width 8 --moves 4";
 
-/// Starts and kills programs. Returns their instances and the ids of their processes, all of which have ended.
+/// Starts and kills programs. Returns all their instances and process ids. All these processes have ended.
 fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, HashSet<u32>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let instances: Vec<Instance> = (0..10).map(|_| new_instance()).collect();
     let began = Instant::now();
     let running = Server::start(FLAGS);
-    // At least as long as a start takes on this machine, so that some programs are killed while they start.
+    // At least the time that a start takes on this machine, so that some programs are killed while they start.
     let longest = (began.elapsed().as_micros() as u64).max(60_000);
     let folder = Folder::default();
     let mut killed = HashSet::new();
@@ -102,7 +102,7 @@ fn kill(n_loops: u64, n_kills: usize, n_kinds: u32) {
             killed.extend(pids);
         }
     });
-    // Runs as a separate program, because it could hang.
+    // Runs as a separate program, because this command could hang.
     let flags = format!("status --instance {}", new_instance().name());
     run(SERVER, &flags).check_says("no server on");
     for instance in &instances {

@@ -1,5 +1,5 @@
-//! Zones, no-fly cells and a wide sensor on a running server. The tests derive what robots must see and earn from only
-//! the paths, the hidden states and the reply to `hello`.
+//! Tests of zones, no-fly cells and a wide sensor on a running server. The expected observations and rewards follow
+//! from only the paths, the hidden states and the reply to `hello`.
 
 use crate::commands::{agent, check};
 use crate::trainings::on;
@@ -64,7 +64,7 @@ fn robots_see_and_earn_what_hello_and_the_hidden_states_say() {
         let mut client = server.acquire(0..2);
         reset(&mut client, 1000);
         let (mut paths, mut total) = (Paths::new(3), 0.0);
-        // For each observation matrix: the number of observed cells, and of those observed in their true state.
+        // For each observation matrix: the number of observed cells, and how many of these were observed correctly.
         let (mut n_seen, mut n_right) = ([0; 2], [0; 2]);
         for _ in 0..200 {
             let starts = client.observe(0..2).expect("observe");
@@ -173,7 +173,7 @@ fn a_land_that_cannot_be_is_refused_and_pockets_are_told_of() {
         folder.write("land.toml", format!("{head}no_fly = {no_fly}\n{rest}"));
         check(SERVER, &format!("{land} --start {start}"), words);
     }
-    // A map with an enclosed pocket of two cells.
+    // A map in which no-fly cells enclose two free cells.
     let pocket = map(|row, col| {
         usize::from(row < 3 && col < 4 && (row, col) != (1, 1) && (row, col) != (1, 2))
     });

@@ -1,4 +1,4 @@
-//! Leases: each robot has one holder, until release, expiry or takeover. These do not change its world.
+//! Tests of leases: each robot has one holder until release, expiry or takeover. None of these changes its world.
 
 use emberwatch_protocol::client::Claim;
 use emberwatch_protocol::connection::ConnectionError;
@@ -41,7 +41,7 @@ fn a_takeover_ends_the_lease_and_keeps_the_world() {
     next.release().expect("release");
     check(former.step(0..1, &path), Status::LeaseLost, us);
     check(former.release(), Status::LeaseLost, us);
-    // The answer to a renewal lists the robots that the lease still holds.
+    // The answer to a renewal lists the robots that the lease still includes.
     let Reply::Lease(renewed) = wire.ask(&Request::Renew { lease }) else {
         panic!("expected a lease");
     };

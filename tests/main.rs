@@ -3,8 +3,8 @@
 //! Run `cargo build --workspace` first, because Cargo does not build another package's programs for a test. `src` has
 //! shared code, `python` speaks the protocol through `wire_reference.py`, and `random_robot` is the example client.
 //! Every other module tests one topic. Each test has its own instance, folder and deadline.
-//! `cargo test -p tests -- --ignored` runs the tests that take minutes, such as deaths at random moments, or that need
-//! Python (`scripts/test` installs it).
+//! `cargo test -p tests -- --ignored` runs the tests that take minutes, such as kills at random moments, and the tests
+//! that need Python (`scripts/test` installs it).
 
 mod agent_beliefs;
 mod autoencoder;

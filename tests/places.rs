@@ -1,7 +1,7 @@
-//! Shared memory and channel directories that are unusable or removed while programs run.
+//! Tests with shared memory and channel directories that are unusable, or removed while programs run.
 //!
 //! These tests run in a separate mount namespace, because all programs share the real directories. Where a process may
-//! not create one, the tests print that and pass, except in CI, where they fail.
+//! not create a namespace, the tests print a note and pass, except in CI, where they fail.
 
 use std::io::Write;
 use std::process::Command;
@@ -98,7 +98,7 @@ fn servers_in_other_pid_namespaces_are_called_so_and_go_on() {
     let Some(said) = apart(&script) else { return };
     assert!(said.contains("it ended with 0"), "{said}");
     assert_eq!(said.matches(refusal).count(), 3, "{said}");
-    // Two servers that both have process id 1, each in its own namespace.
+    // Two servers, each with process id 1 in its own namespace.
     let other = "unshare -p -f --kill-child --mount-proc $S";
     check(
         &format!(

@@ -1,5 +1,5 @@
-//! The protocol byte by byte through a client that shares no code with the others: `wire_reference.py` sends the given
-//! bytes and checks the answers itself.
+//! Sends raw messages through `wire_reference.py`, a client that shares no code with the Rust client. It sends the
+//! given bytes and checks the answers itself.
 
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
 use emberwatch_protocol::channels::Instance;

@@ -1,4 +1,4 @@
-//! Recorded worlds: the truth channel shows the recorded states, and agents act there without a known model.
+//! Tests of recorded worlds: the truth channel shows the recorded states, and agents act there without a known model.
 
 use crate::commands::{agent, check, check_table};
 use crate::trainings::on;
@@ -55,7 +55,7 @@ impl Place {
     fn new(lengths: &[usize], (height, width): (usize, usize)) -> Self {
         let folder = Folder::default();
         let sequence = |(index, &length): (usize, &usize)| {
-            // Base-3 digits of a hash: no step is symmetric, and no two steps are equal.
+            // The states are base-3 digits of a hash, so that no step is symmetric and no two steps are equal.
             Array3::from_shape_fn((length, height, width), |(k, row, col)| {
                 let number = ((index * 97 + k) * height + row) * width + col;
                 let hash = (number as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
@@ -95,7 +95,7 @@ fn truth_of(server: &Server) -> TruthFeed {
     TruthFeed::open(&server.instance, shape).expect("truth")
 }
 
-/// Flies a whole episode, which ends truncated. Returns the states that both the truth channel and full frames show.
+/// Flies a whole episode, which ends truncated. Returns the states of the truth channel, which full frames must show.
 fn episode(client: &mut Client, truth: &TruthFeed, seed: u64) -> Vec<Grid<u8>> {
     reset(client, seed);
     let mut shown = truth.states(0..1, &[seed], 0).expect("truth");

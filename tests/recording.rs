@@ -1,4 +1,4 @@
-//! Recorders: what they record, and how they and their files report missing samples.
+//! Tests of recorders: what they record, and how recorders and recordings report missing samples.
 
 use crate::commands::check_table;
 use emberwatch_protocol::channels::Instance;
@@ -16,7 +16,7 @@ use tests::harness::{
     recorded_info,
 };
 
-/// Creates a temporary folder. Returns it and the path of a file in it that does not exist yet.
+/// Creates a temporary folder. Returns the folder, and the path of a file in it that does not exist yet.
 pub fn new_file() -> (TempDir, PathBuf) {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("test.recording");
@@ -81,7 +81,7 @@ pub fn truths(records: &[Record]) -> Vec<Sample<TruthHeader>> {
     records.iter().filter_map(truth).collect()
 }
 
-/// Waits until a file holds the frame of a step of world 0.
+/// Waits until a file contains the frame of a step of world 0.
 fn wait_for_step(recorder: &Program, file: &Path, step: u64) {
     recorder.until(|| {
         let frames = frames(&read(file).0);
@@ -145,7 +145,7 @@ fn a_killed_recorder_leaves_whole_records() {
     let recorder = start_recorder(&server.instance, &file, "");
     let mut client = server.acquire(0..1);
     fly_on(&mut client, 0, 30);
-    // The recorder writes the frame within about a second without being asked to.
+    // The recorder writes the frame within about a second, without being asked.
     wait_for_step(&recorder, &file, 30);
     recorder.kill();
     let (records, error) = read(&file);

@@ -1,4 +1,4 @@
-//! Replays: what observers receive of a recording and when, and how clients are answered.
+//! Tests of replays: what observers receive from a recording and when, and how clients are answered.
 
 use crate::commands::check;
 use crate::recording::{
@@ -66,7 +66,7 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
     let info = connection.info();
     assert_eq!((info.height, info.n_moves, info.pid), (2, 1, replay.pid()));
     let observer = Observer::frames(&instance).expect("observe");
-    // With `--loop`, the first sample follows the last.
+    // After the last sample, `--loop` starts again with the first.
     let steps = take(&observer, 7)
         .into_iter()
         .map(|it| it.header.result.step);
@@ -84,7 +84,7 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
         Err(ConnectionError::Refused { status, .. }) => assert_eq!(status, Status::NotPermitted),
         other => panic!("expected a refusal, got {other:?}"),
     }
-    // Each round begins with the server's record, before its world's frames.
+    // Each round begins with the server's record, which precedes the frames.
     let shows_world = || match connection.control(&Request::Status {}, PATIENCE) {
         Ok(Reply::Status(status)) => {
             assert_eq!(status.pid, replay.pid());

@@ -1,4 +1,4 @@
-//! Servers that end by a signal or a kill, and the behaviour of their agents and successors.
+//! Tests of servers that end by a signal or a kill, and of the behaviour of their agents and successors.
 
 use emberwatch_protocol::channels::{ChannelError, Instance, create_node};
 use emberwatch_protocol::connection::{Connection, ConnectionError};

@@ -1,6 +1,6 @@
-//! What another user can do to our instances: only block their names, which is reported.
+//! Tests what another user can do to our instances: nothing but block their names, which is reported.
 //!
-//! A thread acts as the other user, which requires root. Without root, these tests print that and pass.
+//! A thread acts as the other user, which requires root. Without root, these tests print a note and pass.
 
 use emberwatch_protocol::channels::{
     Channel, ChannelError, Instance, Ipc, SHARED_MEMORY, Services, channel_directory, create_node,
@@ -40,7 +40,7 @@ fn as_user<T: Send>(user: u32, act: impl FnOnce() -> T + Send) -> Option<T> {
     done
 }
 
-/// Returns all files of this user's channels: those in its directory and those in shared memory.
+/// Returns all files of this user's channels: the files in its directory, and the files in shared memory.
 fn places() -> (Vec<PathBuf>, Vec<PathBuf>) {
     let segments = segments_of(getuid().as_raw());
     (all_under(&channel_directory()), segments.collect())
@@ -55,7 +55,7 @@ fn segments_of(user: u32) -> impl Iterator<Item = PathBuf> {
     own.map(|entry| entry.path())
 }
 
-/// Returns the mode of a path, or `None` if it no longer exists, because other tests remove their files.
+/// Returns the mode of a path. Returns `None` if another test has removed the file meanwhile.
 fn mode(path: &Path) -> Option<u32> {
     std::fs::symlink_metadata(path)
         .ok()
@@ -99,7 +99,7 @@ fn another_user_cannot_connect_observe_read_or_remove() {
             denied(path, OpenOptions::new().write(true).open(path).map(drop));
         }
         denied(&ours, std::fs::read_dir(&ours).map(drop));
-        // The folder decides whether a file may be removed: shared memory has the sticky bit set.
+        // Permission to remove a file depends on its folder. The folder of shared memory has the sticky bit set.
         let removed = remove_file(&segments[0]).expect_err("a segment that is ours");
         assert!(matches!(
             removed.kind(),

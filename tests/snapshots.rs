@@ -1,4 +1,4 @@
-//! Saved worlds that continue bit for bit: snapshots, forks and restarted servers.
+//! Tests of snapshots, forks and restarted servers: saved worlds continue bit for bit.
 
 use crate::commands::check;
 use emberwatch_protocol::Client;
@@ -97,7 +97,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     assert_eq!((shown.header.world, shown.header.result.step), (0, 1));
     let at = |robot: u32| server.observe(robot);
     assert_eq!(at(0), at(1));
-    // A fork has the same future as its world, and is independent of it.
+    // A fork has the same future as the original world, but is independent of it.
     server.command("fork 1 2").check(0);
     refused(&server, "fork 7 2", "no such world");
     assert_eq!(at(2), at(1));
@@ -222,19 +222,19 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
             let seen = client.step(0..2, &path(k)).expect("step");
             assert_eq!(seen, expected[k as usize], "step {k}");
         }
-        // At least two snapshots per round: after 10 steps, and another when that one is written or 10 steps later.
+        // Each round writes at least two snapshots: one after 10 steps, another once that is written or 10 steps later.
         let least = folder.path(&format!("{}-{:012}.snapshot", instance.name(), 2 * round));
         server
             .program
             .until(|| files().last().is_some_and(|newest| *newest >= least));
-        // The latest two, and the first of the round, which survives a loss of power.
+        // The latest two snapshots, and the round's first one, which survives a power failure.
         server.program.until(|| matches!(files().len(), 2 | 3));
         server.kill();
     }
     let server = Server::start_on(&instance, &flags);
     let stands = server.step_of(0);
     server.program.finish();
-    // The newest file is damaged, so the one before it is restored.
+    // The newest snapshot is damaged, so the previous one is restored.
     std::fs::write(files().last().expect("a snapshot"), "EMBRSNAPnonsense").expect("write");
     let server = Server::start_on(&instance, &flags);
     assert_eq!(server.step_of(0), stands, "{}", server.program.stderr());
@@ -286,7 +286,7 @@ fn the_last_few_are_kept_and_one_that_is_spared() {
         assert_eq!(kept.len(), number.min(3));
     }
     save(Durability::Kill, None);
-    assert!(!safe.exists(), "no longer spared");
+    assert!(!safe.exists(), "no longer protected");
 }
 
 #[test]
@@ -370,7 +370,7 @@ fn a_world_in_its_burn_in_begins_again_after_a_restart() {
     server.program.until(|| !snapshots_in(&folder).is_empty());
     server.kill();
     drop(pending);
-    // A copy of the snapshot with the settings of a server with a short burn-in.
+    // Copies the snapshot, but with the settings of a server with a short burn-in.
     let bytes = std::fs::read(&snapshots_in(&folder)[0]).expect("the snapshot");
     let restored = decode(&bytes).and_then(|file| file.restore(&small_spec(ENDLESS)));
     let restored = restored.expect("of that server");

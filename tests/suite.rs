@@ -1,4 +1,4 @@
-//! `emberwatch-agent suite` and `leaderboard`: resumed results, the score, and the page of entries.
+//! Tests of `emberwatch-agent suite` and `leaderboard`: resumed results, the score, and the page of entries.
 
 use crate::commands::{agent, check, check_table};
 use emberwatch_agent::benchmark::report::PolicyRun;
@@ -129,7 +129,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
 fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
     let place = Place::new();
     place.suite("--policies coverage");
-    // Rows as Python writes them for the same worlds.
+    // Rows in the form in which Python writes them, for the same worlds.
     let rows = place.0.text("out/tiny.csv");
     let of_coverage = rows.lines().filter(|row| row.starts_with("coverage"));
     let python: Vec<String> = of_coverage
@@ -249,7 +249,7 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
 #[test]
 fn wrong_suites_and_entries_are_named_before_anything_runs() {
     let place = Place::new();
-    let table = "suite --tasks ash => task ash: No such file | expected one, or wildfire, small
+    let table = "suite --tasks ash => task ash: No such file | expected a file, or one of wildfire, small
 suite --tasks TINY,jacksboro --out OUT --policies coverage,known/beam/xyz => task tiny: policy \"known/beam/xyz\": goal: expected one of | got \"xyz\"
 suite --policies bem => policy: expected one of | got \"bem\"
 suite --worlds 0 => --worlds

@@ -1,4 +1,4 @@
-//! Tasks: a task's worlds equal those of the same flags, and `hello`, `status` and snapshots name the task.
+//! Tests of tasks: a task has the same worlds as the equivalent flags, and `hello`, `status` and snapshots name it.
 
 use crate::commands::{agent, check, check_table};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
@@ -45,7 +45,7 @@ fn hello_status_and_snapshots_name_the_task() {
     let by_hand = Server::start(SMALL_BY_HAND);
     assert_eq!(by_hand.info().task, None);
     assert_eq!(json(&by_hand).get("task"), None);
-    // A snapshot fits a server whose equal settings come from flags.
+    // A snapshot also fits a server that has the same settings from flags.
     for (from, to, is_named) in [(&server, &by_hand, true), (&by_hand, &server, false)] {
         let file = folder.word("one.snapshot");
         from.command(&format!("snapshot {file}")).check(0);
@@ -66,7 +66,7 @@ fn an_agent_refuses_a_server_of_another_task() {
     let server = Server::start(&task);
     let flags = format!("--steps 1 --policy coverage {task}");
     Program::agent(&server.instance, &flags).ends(0);
-    // The server's actual settings count, not the name of its task.
+    // The agent compares the server's actual settings, not the name of its task.
     for (from, to, words) in [
         (
             "burn_in = 3000",
@@ -102,7 +102,7 @@ fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
         agent(&format!("compare --task {task} {policies} --csv {csv}"));
         let runs = read_runs(&folder.path("rows.csv")).expect("rows");
         assert!(runs.iter().map(|run| run.world_seed).eq(0..n_seeds));
-        // Also if a task has more steps and robots than the default of a comparison.
+        // This also holds if a task has more steps and robots than a comparison has by default.
         assert!(
             runs.iter()
                 .all(|run| (run.steps, run.robots) == (max_steps, 4)),
@@ -149,7 +149,7 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
         "compare --task small --height 3 => --task <NAME|FILE> | cannot be used with | --height
 compare --task small --robots 2 => --robots | cannot be used with | --task
 train --task small --moves 3 --out x => --task <NAME|FILE> | cannot be used with | --moves
-evaluate --task ash --checkpoint x => task ash: No such file | expected one, or wildfire, small
+evaluate --task ash --checkpoint x => task ash: No such file | expected a file, or one of wildfire, small
 compare --task PIPE => expected a regular file, got a pipe
 run --task ash => task ash: No such file";
     check_table(AGENT, &table.replace("PIPE", &pipe));

@@ -1,5 +1,5 @@
-//! Several robots in one world, flown by several clients. The same paths give the same bytes. A client that dies,
-//! hangs, is replaced or is refused does not change what the others fly and see.
+//! Tests of several robots in one world, flown by several clients. The same paths lead to the same bytes. A client that
+//! dies, hangs, is replaced or is refused does not affect the paths and observations of other clients.
 
 use crate::commands::check;
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
@@ -95,8 +95,8 @@ fn path(k: u64, robot: u32) -> Vec<u8> {
     path_to_bytes(&Paths::new(k * u64::from(TEAM) + u64::from(robot)).next(N_MOVES))
 }
 
-/// Flies four robots by clients that each hold a share, and returns the observations. The order in which the clients
-/// send changes in each step.
+/// Flies four robots with one client for each range in `shares`. Returns the observations. The order in which the
+/// clients send their paths changes with each step.
 fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
     let flyer = |robots: &Range<u32>| Flyer::new(server, robots.clone());
     let flyers: Vec<_> = shares.iter().map(flyer).collect();
@@ -216,7 +216,7 @@ impl Lab {
         agents
     }
 
-    /// Steps until a result is as wanted, and checks that every step agrees with its paths.
+    /// Steps until `wanted` returns true for a result. Checks that every step has the result that its paths imply.
     fn until(&mut self, agents: &[&Program], mut wanted: impl FnMut(&WorldResult) -> bool) {
         let start = Instant::now();
         while !wanted(&self.step()) {
@@ -280,7 +280,7 @@ fn a_stopped_agent_delays_its_world_until_its_lease_ends() {
     let holder = lab.server.status().worlds[0].holder_pids[3];
     assert_eq!(holder, None);
     three.signal(Signal::CONT);
-    // The world does not wait for this robot, so no refusal reaches the agent until its own next request.
+    // The world does not wait for this robot, so the agent learns of the refusal only with its next request.
     three.ends(3).check_says("lease lost");
 }
 
@@ -335,7 +335,7 @@ fn agents_disturbed_at_random_change_nothing_for_the_others() {
     }
 }
 
-/// Flies four robots by agents that each hold a share, in a world with many fires. Returns paths and reward.
+/// Flies four robots with one agent for each range in `parts`, in a world with many fires. Returns paths and reward.
 fn flown_by(parts: &[Range<u32>], company: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
     const N_STEPS: usize = 40;
     let server = Server::start(
@@ -374,7 +374,7 @@ fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
     let together = flown_by(std::slice::from_ref(&all), "--team");
     assert_eq!(flown_by(&single, "--team"), together);
     assert_eq!(flown_by(&[0..1, 1..4], "--team"), together);
-    // Agents that plan independently fly over the same cells.
+    // Agents that plan independently often fly over the same cells.
     let (paths, alone) = flown_by(&single, "");
     assert!(together.1 > 1.2 * alone, "{} and {alone}", together.1);
     let (shared, _) = flown_by(&single, "--share");

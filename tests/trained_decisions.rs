@@ -1,4 +1,4 @@
-//! `emberwatch-agent train --learner decisions`: learns first a filter, then the choice between options.
+//! Tests of `emberwatch-agent train --learner decisions`, which trains a filter, and then the choice between options.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
@@ -54,7 +54,7 @@ fn decisions_are_learned_and_enter_the_ladder_beside_their_filter() {
     assert_eq!(
         steps(&place, "out"),
         "100",
-        "those that were left of the settings"
+        "the remaining steps of the settings"
     );
     place.refuse("out", &resume, "expected a number of steps, as all 100");
     let compared = place.compare("out", "--policies options");
@@ -112,7 +112,7 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
     place.train("out", &format!("{resume} --time-limit 1e19"));
     let expected = (KernelKind::Own, "learned_spatial_filter".to_owned());
     assert_eq!(saved(&place, "out"), expected);
-    // The checkpoint now holds decisions, from which a training can resume.
+    // The checkpoint now contains decisions, from which a training can resume.
     let filter = place.flag("out/belief");
     let model = repository().join("config/models/wildfire-small.toml");
     let model = std::fs::read_to_string(model).expect("a model");

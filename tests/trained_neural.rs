@@ -1,4 +1,4 @@
-//! `emberwatch-agent train --learner neural`: learns a belief from frames, on which policies act.
+//! Tests of `emberwatch-agent train --learner neural`, which learns a belief from frames. Policies act on this belief.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
@@ -27,11 +27,11 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
     assert!(is_same, "checkpoints of the same training differ");
     let losses: Vec<f64> = rows.iter().filter_map(|row| row[2].parse().ok()).collect();
     assert_eq!(losses.len(), 20);
-    assert!((losses[0] - 3_f64.ln()).abs() < 1e-3, "all alike at first");
+    assert!((losses[0] - 3_f64.ln()).abs() < 1e-3, "uniform at first");
     let resume = format!("{WORLDS} --resume");
     let rows = place.learn("out", &resume);
     let last = rows.last().expect("rows");
-    assert_eq!(last[1], "60", "those that were left of the settings");
+    assert_eq!(last[1], "60", "the remaining steps of the settings");
     place.refuse("out", &resume, "expected a number of steps, as all 60");
     let policies = "--policies neural_beam,neural/options/rule --baseline neural_beam";
     place

@@ -1,4 +1,4 @@
-//! `emberwatch-agent train` and the use of its checkpoints.
+//! Tests of `emberwatch-agent train`, and of commands that use its checkpoints.
 
 use crate::commands::{agent, check, check_table};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
@@ -8,7 +8,7 @@ use emberwatch_protocol::Move;
 use rustix::process::Signal;
 use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly};
 
-/// Settings with which learning starts after 16 world steps of two worlds.
+/// Settings with which learning starts after 16 world steps, summed over two worlds.
 const SETTINGS: &str = "[learning]
 window = 2
 streams = 4
@@ -49,7 +49,7 @@ fn a_training_that_made_no_update_says_why() {
         ),
         (
             "--learner decisions --estimator known_model --steps 14",
-            "14 world steps: an update learns from 9 transitions, and the steps gave 6",
+            "14 world steps: an update learns from 9 transitions, and the steps yielded 6",
         ),
         (
             "--learner neural --steps 30",
@@ -150,7 +150,7 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let files = std::fs::read_dir(place.folder.path("out")).expect("the folder");
     let names = files.map(|file| file.expect("a file").file_name());
     let runs = names.filter(|name| name.to_string_lossy().contains(".tfevents."));
-    assert_eq!(runs.count(), 2, "one for each that learned");
+    assert_eq!(runs.count(), 2, "one file for each run that learned");
     let rows = place.rows("out");
     let [last, first] = [before.len() - 1, before.len()].map(|row| &rows[row]);
     assert_eq!(first[1], "82", "world steps go on");
@@ -294,7 +294,7 @@ fn a_checkpoint_is_compared_evaluated_and_checked() {
     check(AGENT, &format!("evaluate {COMPARED} {out}"), damaged);
 }
 
-/// Flags of `train`, `evaluate` and `compare`, and words of their refusal.
+/// Invalid flags of `train`, `evaluate` and `compare`, and words of the resulting error.
 const WRONG_FLAGS: &str = "
 train => --out
 train --out /proc/no => create /proc/no

@@ -61,7 +61,7 @@ impl Place {
         check(AGENT, &self.words(out, flags), words);
     }
 
-    /// Checks the refusal of each line of a table: flags, ` => ` and words of the error.
+    /// Checks that the flags in each line of a table are refused. A line has flags, an arrow and words of the error.
     pub fn refuse_all(&self, out: &str, flags: &str, table: &str) {
         for line in table.lines() {
             let (more, words) = line.split_once(" => ").expect("flags and words");
@@ -90,7 +90,7 @@ impl Place {
     }
 }
 
-/// Worlds of a very short comparison or evaluation.
+/// Flags of a very short comparison or evaluation.
 pub const COMPARED: &str = "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 \
                             --beam-width 4 --shooting-samples 16";
 

@@ -1,6 +1,6 @@
-"""An independent client, written from PROTOCOL.md on iceoryx2's Python binding.
+"""An independent client, written from PROTOCOL.md, with iceoryx2's Python binding.
 
-It shares no code with the other clients, so that their errors cannot pass as the protocol.
+It shares no code with the other clients, so that it does not repeat their errors.
 "Section" refers to PROTOCOL.md. `wire_reference.py INSTANCE` connects and sends the requests of
 the compliance suite. Each line of its standard input is a request, `{"service": "step",
 "header": "<hex>", "payload": "<hex>"}`; the client itself fills in the last 16 bytes of the
@@ -26,7 +26,7 @@ import iceoryx2 as iox2
 
 VERSION = 2
 
-#: Maximum number of nodes, of listeners and of notifiers per service.
+#: Maximum number of nodes, listeners and notifiers per service.
 MAX_NODES = 64
 
 #: Maximum wait for a turn or an answer, in seconds.
@@ -102,7 +102,7 @@ def check_places() -> None:
 
 @contextlib.contextmanager
 def turn() -> Iterator[None]:
-    """Section 1: takes the lock under which nodes, services and ports are made or removed."""
+    """Section 1: holds the lock that protects creating and removing nodes, services and ports."""
     path, start = ROOT / "lock", time.monotonic()
     holder, since = None, start
     while True:
@@ -138,7 +138,7 @@ def make_way() -> None:
 
 
 def is_unfinished(path: Path) -> bool:
-    """Section 1: returns whether a file is still being made. `.data` files may grow later."""
+    """Section 1: returns whether a file is still being created. `.data` files may grow later."""
     with contextlib.suppress(FileNotFoundError):
         found = path.lstat()
         return path.suffix != ".data" and not (found.st_size and found.st_mode & stat.S_IRUSR)
@@ -146,7 +146,7 @@ def is_unfinished(path: Path) -> bool:
 
 
 def fill_segments() -> None:
-    """Section 1: allocates the memory of this process's segments, whose names hold its ids."""
+    """Section 1: allocates the memory of this process's segments, whose names contain its ids."""
     for path in SHARED_MEMORY.glob(f"{PREFIX}*"):
         words = path.name.removeprefix(PREFIX).partition(".")[0].split("_")
         ids = [int(word) for word in words if word.isdecimal() and len(word) < 40]
@@ -179,7 +179,7 @@ class Port:
         builder = service.request_response(BYTES, BYTES).request_header(header_type(request))
         opened = builder.response_header(header_type(reply)).open()
         check(opened.dynamic_config.number_of_servers == 1, "a server", "none")
-        # Other clients allocate statically for their longest step; the suite sends longer ones.
+        # Other clients allocate statically for their longest step. The suite sends longer ones.
         port = opened.client_builder().initial_max_slice_len(4096)
         self._port = port.allocation_strategy(iox2.AllocationStrategy.PowerOfTwo).create()
 
@@ -192,7 +192,7 @@ class Port:
         return pending
 
     def take(self, pending: Any, response: Any) -> tuple[bytes, bytes]:
-        """Copies an answer's header and payload, and frees it for the next request."""
+        """Copies an answer's header and payload, and frees the answer for the next request."""
         header = ctypes.string_at(response.user_header_ptr, self._size)
         payload = ctypes.string_at(response.payload_ptr, response.payload().len())
         response.delete()
@@ -251,19 +251,19 @@ class Client:
         return answer
 
     def _exchange(self, port: Port, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
-        """Section 8: wakes the server and waits for its answer or its end."""
+        """Section 8: wakes the server, and waits until it answers or ends."""
         pending = port.send(header, payload)
         self._notifier.notify()
         start, is_gone = time.monotonic(), False
         while True:
-            # Receives before the check for the end, because the last answer may precede it.
+            # Receives before it checks for the server's end, because the last answer may precede it.
             response = pending.receive()
             if response is not None:
                 return port.take(pending, response)
             waited = time.monotonic() - start
             check(not is_gone and waited < TIMEOUT, "an answer", f"none after {waited} s")
             if waited > 100e-6:
-                # Also removes pending wake-ups.
+                # Also discards pending wake-ups.
                 self._listener.timed_wait(iox2.Duration.from_millis(50))
                 watched = [] if self._process is None else [self._process]
                 is_gone = bool(select.select(watched, [], [], 0)[0])
@@ -300,7 +300,7 @@ class Client:
 
 
 def main() -> None:
-    """Sends the requests on standard input until its end."""
+    """Sends the requests from standard input, until it ends."""
     iox2.set_log_level(iox2.LogLevel.Fatal)
     client = Client(sys.argv[1])
     for line in sys.stdin:

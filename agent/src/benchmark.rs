@@ -1,4 +1,4 @@
-//! Policies on the same worlds, scored against the hidden states.
+//! Benchmarks: runs policies on the same worlds, and scores them against the hidden states.
 
 pub(crate) mod arena;
 pub(crate) mod compare;

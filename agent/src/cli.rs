@@ -64,7 +64,7 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Starts rayon's global threads now, so that a failure is an error. Started at their first use, a failure would panic.
+/// Starts rayon's global threads now, so that a failure is returned as an error. At first use, a failure would panic.
 fn start_threads() -> Result<(), NoThreads> {
     let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
     let started = ThreadPoolBuilder::new().build_global();

@@ -1,4 +1,4 @@
-//! Communication with the server: connections, hidden states for scores, beliefs for observers.
+//! Communication with the server: connections, hidden states for scoring, and beliefs for observers.
 
 pub(crate) mod errors;
 pub(crate) mod info;

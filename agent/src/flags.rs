@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// The settings that measured best
+    /// The settings with the best measured results
     Default,
     /// The settings of the paper's authors
     Paper,
@@ -40,7 +40,7 @@ pub struct AgentFlags {
     pub agent_seed: Option<u64>,
 }
 
-/// Returns a parser for a flag with these values: each has its name and its explanation in `--help`.
+/// Returns a parser for a flag with these values. Each has a name and an explanation for `--help`.
 pub fn one_of<T: Copy + Send + Sync + 'static>(
     all: &'static [(T, &str, &str)],
 ) -> impl TypedValueParser<Value = T> {

@@ -4,7 +4,7 @@ pub use mimalloc::MiMalloc as Allocator;
 use std::thread::available_parallelism;
 
 /// `mi_option_purge_delay` of mimalloc.h, which libmimalloc-sys does not name: milliseconds after which freed
-/// memory is returned to the system; never if negative.
+/// memory is returned to the system. A negative value means never.
 const PURGE_DELAY: libmimalloc_sys::mi_option_t = 15;
 
 /// Environment variables with candle's thread counts. Without the first, candle reads `/proc/cpuinfo` for each matrix

@@ -57,7 +57,7 @@ pub struct TrainSummary {
     pub learning: Duration,
 }
 
-/// Trains on a server until the steps are done, the deadline has passed or `stop` is set. Saves in any case.
+/// Trains on a server until the steps are done, the deadline has passed or `stop` is set. Always saves at the end.
 /// `contents` is the result of [`TrainingSpec::check`].
 pub fn train(
     instance: &Instance,

@@ -1,4 +1,4 @@
-//! The subcommand `prior` writes the belief with which a filter of the same settings begins.
+//! The subcommand `prior` writes the belief from which a filter with the same settings starts.
 
 use emberwatch_belief::estimation::Prior;
 use emberwatch_protocol::{Model, Probabilities, Shape};
@@ -16,7 +16,7 @@ fn the_file_holds_the_belief_that_a_filter_begins_with() {
         n_worlds: 9,
         burn_in: 40,
     };
-    // The first belief is simulated once per seed, and kept in the cache.
+    // The first belief is simulated once per seed, then read from the cache.
     for (seed, is_simulated) in [(3, true), (3, false), (4, true)] {
         let mut command = Command::new(env!("CARGO_BIN_EXE_emberwatch-agent"));
         command.current_dir(folder.path()).env("RUST_LOG", "info");

@@ -1,4 +1,4 @@
-//! Reports on synthetic results: their text, their files and their pictures.
+//! Tests of reports on synthetic results: text, files and figures.
 
 mod figures;
 mod files;

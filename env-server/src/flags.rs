@@ -11,7 +11,7 @@ use serde::Serialize;
 use serde_json::Value;
 use std::path::PathBuf;
 
-/// The settings of [`ServerConfig`] as flags; each overrides the file.
+/// The settings of [`ServerConfig`] as flags. Each flag overrides the setting in the file.
 #[derive(Debug, Default, Args, Serialize)]
 pub struct ServerFlags {
     /// Read settings from this TOML file
@@ -45,7 +45,7 @@ pub struct ServerFlags {
         "Show recorded states, which set model, grid and burn-in: {} or the path of a .npz or .npy file or of a folder",
         listed(state_names())))]
     pub states: Option<String>,
-    /// Let seeds also choose among the symmetries of the grid
+    /// Let seeds also select a symmetry of the grid
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
     pub states_symmetries: Option<bool>,
     /// Maximum recorded step at which an episode begins; the seed draws one from 0 to this [default: 0]
@@ -75,31 +75,32 @@ pub struct ServerFlags {
     /// Start cells of robots: corner (a different one for each), centre, random or ROW,COL [default: corner]
     #[arg(long, value_parser = start_of)]
     pub start: Option<Start>,
-    /// Publish the hidden states, for evaluation and pictures
+    /// Publish the hidden states, for evaluation and display
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
     pub publish_truth: Option<bool>,
     /// Send clients the model [default: true]
     #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
     pub reveal_model: Option<bool>,
-    /// Time after its last use when a lease ends, in milliseconds [default: 30000]
+    /// Time from the last use of a lease until it ends, in milliseconds [default: 30000]
     #[arg(long)]
     pub lease_millis: Option<u64>,
     /// Number of threads that simulate, 0 for one per core [default: 0]
     #[arg(long)]
     pub threads: Option<usize>,
-    /// Number of latest steps per world whose frames are kept for agents that take over [default: 256]
+    /// Number of the latest steps of each world whose frames are kept for agents that take over [default: 256]
     #[arg(long)]
     pub history: Option<u32>,
     /// Start with the worlds of this snapshot file, or of the latest one in this folder, if there is one
     #[arg(long, value_name = "FILE|FOLDER")]
     pub restore: Option<String>,
-    /// Average steps of the worlds between two snapshots; one more is written at the end [default: 0, never]
+    /// Number of steps, on average over the worlds, between two snapshots; another is written at the end [default: 0,
+    /// never]
     #[arg(long, value_name = "STEPS")]
     pub snapshot_every: Option<u64>,
     /// Folder for these snapshots
     #[arg(long, value_name = "FOLDER")]
     pub snapshot_dir: Option<String>,
-    /// Number of these snapshots to keep, in addition to the latest that is safely on disk [default: 3]
+    /// Number of these snapshots to keep, in addition to the latest one that is safely on disk [default: 3]
     #[arg(long)]
     pub snapshot_keep: Option<u32>,
 }

@@ -1,6 +1,6 @@
 //! The Emberwatch server: simulates worlds and serves them to agents over shared memory.
 //!
-//! [`server`] has the main loop and the channels. [`recording`] records what a server publishes, and replays
+//! [`server`] contains the main loop and the channels. [`recording`] records what a server publishes, and replays
 //! recordings. Worlds, leases and snapshots are in the crate `emberwatch-sim`.
 
 #![allow(missing_docs, reason = "a program; only its tests use the library")]

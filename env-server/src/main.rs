@@ -37,9 +37,9 @@ enum Command {
     Stop(commands::StopCommand),
     /// Write worlds of a running server to a file
     Snapshot(commands::SnapshotCommand),
-    /// Replace worlds of a running server by worlds from a file
+    /// Replace worlds of a running server with worlds from a file
     Restore(commands::RestoreCommand),
-    /// Replace a world of a running server by a copy of another world
+    /// Replace a world of a running server with a copy of another world
     Fork(commands::ForkCommand),
     /// Record the frames that an instance publishes to a file
     Record(commands::RecordCommand),

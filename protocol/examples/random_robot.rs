@@ -3,7 +3,7 @@
 //! `emberwatch-server --instance lab &`, then
 //! `cargo run -p emberwatch-protocol --example random_robot -- lab`
 
-#![expect(clippy::print_stdout, reason = "what the robot found is the output")]
+#![expect(clippy::print_stdout, reason = "the rewards are the output")]
 
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, STEP_TIMEOUT};

@@ -17,8 +17,8 @@ fn main() {
     write("states", states);
 }
 
-/// Lists the entries of a folder by name, each as a Rust tuple of its name and `contents`. The entries are the files
-/// with this extension, or the subfolders if `extension` is empty.
+/// Lists the entries of a folder, sorted by name. Each entry is a Rust tuple of its name and `contents`. The entries
+/// are the files with this extension, or the subfolders if `extension` is empty.
 fn entries(folder: &str, extension: &str, contents: impl Fn(PathBuf) -> String) -> Vec<String> {
     println!("cargo:rerun-if-changed={folder}");
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);

@@ -4,11 +4,11 @@
 //! and [`message`] over a [`Connection`]. An [`observer`] reads the samples that a server publishes, and a
 //! [`recording`] stores them in a file. [`responder`], [`channels`] and [`failed_connections`] are for servers.
 //!
-//! The crate `emberwatch-messages` has the messages, and `emberwatch-model` the mathematics of the worlds. The parts of
-//! both that a client needs are re-exported here. PROTOCOL.md describes the wire for other languages.
+//! The crate `emberwatch-messages` contains the messages, and `emberwatch-model` the mathematics of the worlds. The
+//! parts of both crates that a client needs are re-exported here. PROTOCOL.md describes the wire for other languages.
 //!
 //! Terms: a *world* is the hidden state of one grid. A *step* `k` flies one path with each robot and moves the world
-//! once. A *frame* holds the observations of a step. A *lease* is the right to fly robots.
+//! once. A *frame* contains the observations of a step. A *lease* is the right to fly robots.
 
 #[cfg(feature = "program")]
 pub mod program;

@@ -1,4 +1,4 @@
-//! The start of every program: logs to standard error, and stops on signals or when another process ends.
+//! Start-up code of every program: logging to standard error, and stopping on signals or when another process ends.
 
 use emberwatch_messages::limits::threads::spawn;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -17,8 +17,8 @@ pub use emberwatch_model::text::{MAX_TEXT_BYTES, read_text};
 
 const SAME_SIGNAL: Duration = Duration::from_millis(500);
 
-/// Starts logging to standard error. `RUST_LOG` sets the level, also by target (`warn`, `warn,emberwatch_agent=debug`);
-/// the default is `info`.
+/// Starts logging to standard error. `RUST_LOG` sets the level, also per target (`warn`,
+/// `warn,emberwatch_agent=debug`); the default is `info`.
 pub fn start_logging() {
     let wanted = std::env::var("RUST_LOG");
     let filter = wanted.ok().and_then(|text| text.parse::<Targets>().ok());
@@ -36,7 +36,7 @@ pub fn start_logging() {
 /// send one signal to a process and to its group, so signals within half a second of the first count as the same one.
 ///
 /// # Errors
-/// If the system refuses a handler or a thread.
+/// If the system does not allow a handler or a thread.
 pub fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();

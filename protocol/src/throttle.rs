@@ -30,7 +30,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_warning_is_said_and_then_their_number() {
+    fn one_warning_is_logged_and_later_the_number_suppressed() {
         let (mut throttle, start) = (Throttle::default(), Instant::now());
         let moments = [0, 1, 2, 9_999, 10_000, 10_001, 30_000, 60_000];
         let said = moments.map(|millis| throttle.pass(start + Duration::from_millis(millis)));

@@ -1,5 +1,5 @@
 //! Checks that ARCHITECTURE.md names every room (folder of sources) and only existing files, that rooms use only rooms
-//! below them, and that no files depend on each other in a circle. The index of documents must be complete, and each
+//! below them, and that no files depend on each other in a cycle. The index of documents must be complete, and each
 //! test file must be a module of its test program.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
-/// Folders of sources. Each folder in them that has source files is a room.
+/// Folders of sources. Each folder in them that contains source files is a room.
 const SOURCES: [&str; 15] = [
     "protocol/src",
     "protocol/messages/src",
@@ -31,14 +31,14 @@ fn crates() -> impl Iterator<Item = &'static str> {
     SOURCES.iter().filter_map(|name| name.strip_suffix("/src"))
 }
 
-/// The files of a crate by the path of their module from the root, each with the files that it depends on.
+/// The files of a crate, by module path from the root. Each file maps to the set of files on which it depends.
 type Graph = BTreeMap<Vec<String>, BTreeSet<Vec<String>>>;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// Returns the rooms of the table, in its order.
+/// Returns the rooms in the order of the table.
 fn rooms() -> Vec<&'static str> {
     let rows = ARCHITECTURE.lines().filter(|line| line.starts_with("| `"));
     let room = |row: &'static str| row.split('`').nth(1).expect("a room");
@@ -81,7 +81,7 @@ fn every_room_is_listed_and_every_room_and_file_named_exists() {
     let rooms = rooms();
     let files: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
     let found: BTreeSet<String> = files.iter().map(|path| room_of(path)).collect();
-    // Folders that contain rooms, and folders inside a room, need no line in the table.
+    // Folders that contain rooms and folders inside a room need no row in the table.
     let inner = [
         "agent/network/src/ops",
         "agent/network/src/dqn",
@@ -96,7 +96,7 @@ fn every_room_is_listed_and_every_room_and_file_named_exists() {
     }
     assert!(files.len() > 80, "{files:?}");
     for room in rooms {
-        assert!(root().join(room).exists(), "{room} is not there");
+        assert!(root().join(room).exists(), "{room} does not exist");
     }
     let quoted = ARCHITECTURE.split('`').skip(1).step_by(2);
     for name in quoted.filter(|name| is_source(name)) {
@@ -243,8 +243,8 @@ fn graph_of(name: &str) -> Graph {
     graph(texts)
 }
 
-/// Returns the files that each file depends on: its child modules, and every module that a path from `crate`, `super`
-/// or `self` names.
+/// Returns the files on which each file depends: its child modules, and every module named by a path that begins with
+/// `crate`, `super` or `self`.
 fn graph(texts: BTreeMap<Vec<String>, String>) -> Graph {
     let file_of = |path: &[String]| {
         let mut ends = (0..=path.len()).rev().map(|end| path[..end].to_vec());
@@ -265,7 +265,8 @@ fn graph(texts: BTreeMap<Vec<String>, String>) -> Graph {
     graph
 }
 
-/// Returns every path in the code that begins with `crate`, `super` or `self`, from the crate's root, up to a brace.
+/// Returns every path in the code that begins with `crate`, `super` or `self`. Paths are relative to the crate's root,
+/// and end before a brace.
 fn paths(text: &str, module: &[String]) -> Vec<Vec<String>> {
     let code = text.split("#[cfg(test)]\nmod tests").next();
     let lines = code.unwrap_or_default().lines();
@@ -291,7 +292,7 @@ fn paths(text: &str, module: &[String]) -> Vec<Vec<String>> {
     found
 }
 
-/// Returns the files that a file depends on, directly or indirectly.
+/// Returns the files on which a file depends, directly or indirectly.
 fn reached<'a>(graph: &'a Graph, from: &'a Vec<String>) -> BTreeSet<&'a Vec<String>> {
     let mut reached = BTreeSet::new();
     let mut next = vec![from];
@@ -301,7 +302,7 @@ fn reached<'a>(graph: &'a Graph, from: &'a Vec<String>) -> BTreeSet<&'a Vec<Stri
     reached
 }
 
-/// Returns the files of one circle, if there is one.
+/// Returns the files of one circular dependency, if there is any.
 fn circle(graph: &Graph) -> Vec<Vec<String>> {
     let all: BTreeMap<_, _> = graph
         .keys()

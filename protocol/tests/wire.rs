@@ -25,7 +25,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use serde_json::Value;
 use std::collections::BTreeSet;
 
-/// Returns the fields of a struct. If a field is not listed, this does not compile.
+/// Returns the fields of a struct. The macro does not compile if a field is missing from the list.
 macro_rules! fields {
     ($name:ident: $($field:ident)*) => {{
         let $name { $($field),* } = $name::default();
@@ -57,7 +57,7 @@ fn type_name<T: Header>() -> &'static str {
     unsafe { <WireHeader<T> as ZeroCopySend>::type_name() }
 }
 
-/// Returns the type of a field as in PROTOCOL.md.
+/// Returns the type of a field as PROTOCOL.md writes it.
 fn type_of<T>(_: &T) -> String {
     match std::any::type_name::<T>() {
         "[u8; 8]" => "u8[8]".into(),
@@ -130,7 +130,7 @@ fn every_code_is_documented() {
     assert!(PROTOCOL.contains(&format!("**{UNOBSERVED} where nothing was")));
 }
 
-/// Returns constants with their names.
+/// Returns constants together with their names.
 macro_rules! limits {
     ($($name:ident)*) => {
         [$((stringify!($name).to_owned(), $name)),*]
@@ -215,7 +215,7 @@ fn a_recording_is_laid_out_as_documented() {
         format!("stored, at most {MAX_STORED_BYTES} |"),
         format!("of at most {MAX_BODY_BYTES} bytes"),
     ] {
-        assert!(PROTOCOL.contains(&sentence), "{sentence:?} is not there");
+        assert!(PROTOCOL.contains(&sentence), "{sentence:?} is missing");
     }
     let [end] = lines_of_fences(" end")[..] else {
         panic!("expected one example of an end")
@@ -257,7 +257,7 @@ fn snake_case<T: serde::Serialize>(value: &T) -> String {
     text.replace('"', "")
 }
 
-/// Returns every variant of a tagged enum, as serde lists them in the error for an unknown one.
+/// Returns every variant of a tagged enum, as listed by serde in the error for an unknown variant.
 fn variants_of<T: serde::de::DeserializeOwned>(tag: &str) -> BTreeSet<String> {
     let unknown = serde_json::from_str::<T>(&format!(r#"{{"{tag}":"?"}}"#));
     let error = unknown.err().expect("no such variant").to_string();

@@ -18,7 +18,7 @@ fn main() {
     report("a client waits on a killed server", killed_server);
 }
 
-/// Prints the median and the maximum time, and their ratio to the reference's median.
+/// Prints the median and the maximum time, and the ratio of the median to the reference's median.
 fn report(what: &str, mut measure: impl FnMut() -> (Duration, Duration)) {
     let times: Vec<_> = (0..N_ROUNDS).map(|_| measure()).collect();
     let millis = |time: fn(&(Duration, Duration)) -> Duration| {

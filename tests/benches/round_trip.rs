@@ -1,9 +1,9 @@
 //! Round trip of a step from a Rust client to a server process and back:
 //! `cargo bench -p tests --bench round_trip`; arguments after `--` go to the server.
 //!
-//! Prints median and tail in microseconds without the simulation's own time, first on the machine as it is, then with
-//! three additional busy processes. Then prints the processor time of an idle server. `scripts/bench` measures
-//! Gymnasium's AsyncVectorEnv in the same run for comparison.
+//! Prints median and tail latency in microseconds, without the time that the simulation takes: first on the machine as
+//! it is, then with three additional busy processes. Then prints the processor time of an idle server. `scripts/bench`
+//! measures Gymnasium's AsyncVectorEnv in the same run for comparison.
 
 use std::ops::Range;
 use std::sync::Barrier;
@@ -15,7 +15,7 @@ use tests::stepper::Stepper;
 
 const N_STEPS: usize = 50_000;
 
-/// Robots that repeat the same paths.
+/// A client whose robots repeat the same paths.
 struct Flight {
     stepper: Stepper,
     paths: Vec<u8>,
@@ -51,7 +51,7 @@ impl Flight {
     }
 }
 
-/// Median, 99th and 99.9th percentile in microseconds.
+/// Formats the median, 99th and 99.9th percentile in microseconds.
 fn spread(nanos: impl Iterator<Item = u64>) -> String {
     let micros = nanos.map(|nanos| nanos as f64 / 1000.0).collect();
     let [median, high, highest] = quantiles(micros, [0.5, 0.99, 0.999]);

@@ -1,4 +1,4 @@
-//! Regenerates the generated files of `fuzz/corpus`. Needed after a change of a format.
+//! Regenerates the generated files of `fuzz/corpus`. Run it after a format has changed.
 
 fn main() -> std::io::Result<()> {
     let mut targets = tests::fuzz::TARGETS.iter();

@@ -1,7 +1,7 @@
-//! A custom estimator acts on worlds in this process, next to policies of the benchmark.
+//! Example of a custom estimator: it acts on worlds in this process, and is compared with policies of the benchmark.
 //!
-//! It believes that each cell is in the state it last observed there, with a confidence that decreases each step. Run
-//! it with `cargo run --release -p tests --example own_belief`.
+//! The estimator believes that each cell is still in the state last observed there, with a confidence that decreases
+//! each step. Run it with `cargo run --release -p tests --example own_belief`.
 
 use anyhow::Result;
 use emberwatch_belief::Belief;
@@ -25,7 +25,7 @@ const KEPT: f32 = 0.95;
 const WORLDS: u32 = 4;
 const STEPS: u64 = 100;
 
-/// An estimator that believes the last observation of each cell, decaying to the initial belief.
+/// An estimator that believes the last observation of each cell. This belief decays to the initial belief.
 struct LastSeen {
     belief: Belief,
     first: Belief,
@@ -36,7 +36,7 @@ struct LastSeen {
 const LAST_SEEN: BeliefKind = BeliefKind {
     name: "last_seen",
     label: "last_seen",
-    about: "what each cell showed last, and less surely each step",
+    about: "the last observation of each cell, less certain with each step",
     input: Input::Frames,
     knows_model: true,
     learned_by: None,

@@ -13,7 +13,7 @@ use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// One control request of each kind, except shutdown, takeovers and file requests, which any client may use.
+/// One control request of each kind. Excludes shutdown, takeovers and file requests, which any client may use.
 const TEMPLATES: [&str; 8] = [
     r#"{"op":"hello","protocol":2,"client":"x"}"#,
     r#"{"op":"acquire","first_robot":1,"n_robots":1}"#,
@@ -29,9 +29,9 @@ const TEMPLATES: [&str; 8] = [
 pub struct Attacker {
     wire: Wire,
     rng: ChaCha8Rng,
-    /// Leases to try: none, its own and the victim's.
+    /// Leases to try: no lease, the attacker's lease and the victim's lease.
     leases: Vec<u64>,
-    /// The latest step that an answer showed.
+    /// The latest step that an answer reported.
     k: u64,
     pub n_refused: u64,
     pub n_accepted: u64,
@@ -52,7 +52,7 @@ impl Attacker {
         }
     }
 
-    /// Sends one message, and usually waits for its answer.
+    /// Sends one message, and usually waits for the answer.
     pub fn strike(&mut self) {
         let status = if self.rng.random() {
             self.strike_step()
@@ -137,7 +137,7 @@ impl Attacker {
         Some(reply.status)
     }
 
-    /// Returns the right number in most cases, and otherwise one that is close, huge or random.
+    /// Returns the right number in most cases, and otherwise a number that is close, huge or random.
     fn number(&mut self, right: u32) -> u32 {
         match self.rng.random_range(0..50) {
             0 => right.wrapping_add(1),

@@ -1,7 +1,7 @@
-//! Hostile bytes for every decoder: one function per format, which checks properties that must hold for any bytes.
+//! Fuzz targets: one function per format, which decodes hostile bytes and checks properties that must always hold.
 //!
-//! [`TARGETS`] lists them. `tests/decoders.rs` runs each target on damaged copies of its corpus, `fuzz/corpus/<name>/`.
-//! `fuzz/` runs the same functions under libFuzzer.
+//! [`TARGETS`] lists all targets. `tests/decoders.rs` runs each target on damaged copies of its corpus,
+//! `fuzz/corpus/<name>/`. `fuzz/` runs the same functions under libFuzzer.
 
 mod besieged;
 mod files;
@@ -49,7 +49,7 @@ const fn target(name: &'static str, body: fn(&[u8]) -> bool, seeds: fn() -> Vec<
 /// Runs the target of this name on bytes.
 ///
 /// # Panics
-/// If the target finds an error in its decoder, or there is no such target.
+/// If the target finds an error in its decoder, or if there is no such target.
 pub fn decode(name: &str, bytes: &[u8]) -> bool {
     let target = TARGETS.iter().find(|target| target.name == name);
     (target.expect("a target of this name").body)(bytes)

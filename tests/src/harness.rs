@@ -83,7 +83,7 @@ impl Server {
         server
     }
 
-    /// Starts a server of two worlds like those of [`SMALL`], at k = 0, in which resets never end.
+    /// Starts a server with two worlds at k = 0, which have the size of [`SMALL`]. Resets of these worlds never end.
     pub fn start_with_endless_resets(flags: &str) -> Self {
         let WorldSpec {
             settings,
@@ -150,7 +150,7 @@ impl Server {
         )
     }
 
-    /// Kills the server with SIGKILL and waits for its end.
+    /// Kills the server with SIGKILL and waits until it has ended.
     pub fn kill(self) {
         self.program.kill();
     }
@@ -260,7 +260,7 @@ pub fn fly(client: &mut Client, path: Vec<Move>) -> Observation {
     client.step(robots, &[path]).expect("step").remove(0)
 }
 
-/// Flies a random path in each step with a client's only robot.
+/// Flies `n_steps` random paths with a client's only robot.
 pub fn fly_on(client: &mut Client, seed: u64, n_steps: usize) -> Vec<Observation> {
     let paths = Paths::new(seed)
         .take(client.info().n_moves, n_steps)
@@ -290,7 +290,7 @@ pub fn seen_by(observation: &Observation) -> Seen {
     (observation.world, observation.robot, frame)
 }
 
-/// Reads frames until the one of this world and step arrives. Returns all of them.
+/// Reads frames until the frame of this world and step arrives. Returns all frames read.
 pub fn frames_until(
     observer: &Observer<FrameHeader>,
     world: u32,

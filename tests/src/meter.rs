@@ -1,4 +1,4 @@
-//! Measurements of the resources that a process uses.
+//! Measures the resources that a process uses.
 
 use emberwatch_protocol::channels::SHARED_MEMORY;
 use std::os::unix::fs::MetadataExt;
@@ -28,7 +28,7 @@ impl Use {
         };
         let mut files = all_under(Path::new(SHARED_MEMORY));
         files.retain(|path| is_own(path) && !path.is_dir());
-        // The allocated blocks of a file, of 512 bytes each.
+        // The number of allocated blocks of a file. A block has 512 bytes.
         let blocks = |path: &PathBuf| path.metadata().map_or(0, |file| file.blocks());
         Self {
             resident: memory("VmRSS:", pid),
@@ -54,7 +54,7 @@ impl std::fmt::Display for Use {
     }
 }
 
-/// Reads a line in KiB from a process's `/proc/<pid>/status`. Returns 0 if it does not exist.
+/// Reads the value of a line, in KiB, from `/proc/<pid>/status`. Returns 0 if there is no such line.
 pub fn memory(line: &str, pid: u32) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
     let found = status.lines().find_map(|text| text.strip_prefix(line));

@@ -1,5 +1,5 @@
-//! A copy of a server's world that repeats its published steps in this process, to check them. Also a world on a server
-//! that steps only as fast as it is checked.
+//! A copy of a server's world that repeats the published steps in this process, to check them. Also a world on a server
+//! that steps only as fast as its steps are checked.
 
 use crate::harness::{PATIENCE, Paths, Server, frames_until, robots_of};
 use emberwatch_protocol::client::Claim;
@@ -42,8 +42,8 @@ impl Mirror {
         Self { rules, episode }
     }
 
-    /// Repeats a published step with the paths and masks of its sample. Returns whether the sample is new, not the
-    /// previous one published again.
+    /// Repeats a published step with the paths and masks of its sample. Returns false if the sample repeats the
+    /// previous one.
     ///
     /// # Panics
     /// If a step is missing, or the sample differs from the result of its paths.
@@ -104,7 +104,7 @@ fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
     (robot.frame().as_bytes(), path_to_bytes(robot.path()))
 }
 
-/// World 0 of a server. This process flies one robot, and checks each step before the next to miss none.
+/// World 0 of a server. This process flies one robot, and checks each step before the next one, so that it misses none.
 pub struct PacedWorld {
     pub client: Client,
     pub last: WorldResult,
@@ -131,7 +131,7 @@ impl PacedWorld {
         }
     }
 
-    /// Flies a path, checks all steps published until then, and passes each to `tell`.
+    /// Flies a path, checks all steps published by then, and passes each step to `tell`.
     pub fn step(&mut self, mut tell: impl FnMut(&Sample<FrameHeader>)) {
         let path = self.paths.next(self.client.info().n_moves);
         let (start, robots) = (Instant::now(), self.client.robots());

@@ -1,4 +1,4 @@
-//! Programs as child processes. Waits for them have deadlines, and dropping one kills it.
+//! Runs programs as child processes. Every wait has a deadline, and dropping a program kills it.
 
 use emberwatch_protocol::channels::Instance;
 use rustix::process::{Pid, Signal, kill_process};
@@ -94,7 +94,7 @@ impl Program {
             .stdout(file("stdout"))
             .stderr(file("stderr"))
             .env("RUST_LOG", "info")
-            // Keeps the program away from the user's cache: nothing can be stored here.
+            // Keeps the program from using the user's cache: nothing can be stored here.
             .env("XDG_CACHE_HOME", "/dev/null")
             .spawn();
         Self {

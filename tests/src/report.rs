@@ -1,4 +1,4 @@
-//! Output of benchmarks and long runs.
+//! Statistics that benchmarks and long runs print.
 
 use std::io::Write;
 
@@ -6,7 +6,7 @@ pub fn say(line: &str) {
     let _ = writeln!(std::io::stdout(), "{line}");
 }
 
-/// Returns quantiles of numbers: 0.5 is the median, 1.0 the maximum.
+/// Returns quantiles of values: 0.5 is the median, 1.0 the maximum.
 pub fn quantiles<const N: usize>(mut numbers: Vec<f64>, shares: [f64; N]) -> [f64; N] {
     numbers.sort_unstable_by(f64::total_cmp);
     let last = numbers.len() - 1;

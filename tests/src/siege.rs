@@ -1,5 +1,5 @@
-//! A server under attack. Meanwhile a victim steps its world, which must evolve as if it were alone. Afterwards the
-//! server must not hold more resources than before.
+//! A server under attack. During the attack, a victim steps its world, which must evolve as if there were no attacker.
+//! Afterwards the server must not hold more resources than before.
 
 use crate::harness::{PATIENCE, Paths, Server, eventually};
 use crate::meter::{memory, n_descriptors};
@@ -11,12 +11,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
-/// Three worlds: the victim's, the attacker's, and a free one.
+/// Flags of a server with three worlds: the victim's, the attacker's, and a free one.
 pub const FLAGS: &str =
     "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3 --lease-millis 86400000";
 
-/// Maximum growth of a server's private memory. Its allocator keeps some of the memory of the longest request (up to
-/// 5 MiB were measured), and the tables of clients are bounded.
+/// Maximum growth of a server's private memory. The allocator keeps some of the longest request's memory (up to 5 MiB
+/// were measured). The tables of clients are bounded.
 const MOST_GROWTH_KIB: u64 = 8 << 10;
 
 /// Pause between the victim's steps, which leaves processor time for the attacker.
@@ -32,8 +32,8 @@ struct Holdings {
     own: u64,
 }
 
-/// Starts a server and a victim, and runs an attack, which gets the victim's lease. Then checks that the victim was
-/// undisturbed and that the server holds no more resources.
+/// Starts a server and a victim, and runs an attack that knows the victim's lease. Then checks that the victim was
+/// undisturbed, and that the server holds no more resources than before.
 pub fn besiege(attack: impl FnOnce(&Server, u64)) {
     let server = Server::start(FLAGS);
     let (tell_lease, stolen) = channel();
@@ -42,7 +42,7 @@ pub fn besiege(attack: impl FnOnce(&Server, u64)) {
         let victim = scope.spawn(|| live(&server.instance, &tell_lease, &stop));
         let stolen = stolen.recv_timeout(PATIENCE).expect("a lease");
         let before = Holdings::of(server.program.pid());
-        // Stops the victim also if the attack panics; otherwise it would never end.
+        // Stops the victim even if the attack panics. Otherwise the victim would never end.
         let stopped = Stop(&stop);
         attack(&server, stolen);
         check_holdings(server.program.pid(), &before);

@@ -1,4 +1,4 @@
-//! A minimal client that steps as fast as the channel allows and leaves answers as bytes.
+//! A minimal client that steps as fast as the channel allows, and does not decode the answers.
 
 use crate::programs::PATIENCE;
 use emberwatch_protocol::Connection;

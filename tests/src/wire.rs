@@ -1,5 +1,5 @@
-//! The protocol byte by byte: headers and payloads as a client in another language or a hostile client sends them.
-//! Nothing is filled in or checked.
+//! Sends raw headers and payloads, as a client in another language or a hostile client would. Nothing is filled in or
+//! checked.
 
 use crate::programs::PATIENCE;
 use emberwatch_protocol::channels::{
@@ -27,7 +27,7 @@ pub type ControlAnswer = (ControlReply, Vec<u8>);
 
 pub type Requests<Q, R> = Client<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// A sent request that waits for its answer.
+/// A sent request whose answer has not arrived.
 pub type Pending<Q, R> = PendingResponse<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// A client of the compliance suite, which sends raw messages and waits for their answers.
@@ -38,7 +38,7 @@ pub trait RawClient {
     /// Sends bytes on `control` and waits for the answer.
     fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer;
 
-    /// Returns the id of the process that the server sees as the client.
+    /// Returns the process id that the server sees as the client's.
     fn pid(&self) -> u32;
 
     /// Sends a well-formed control request, and checks that the status in the header equals the reply's.
@@ -80,7 +80,7 @@ impl Wire {
         Self::try_open(instance).expect("open the channels")
     }
 
-    /// Like [`Self::open`], but returns the error.
+    /// Opens both channels as [`Self::open`] does, but returns an error instead of panicking.
     pub fn try_open(instance: &Instance) -> Result<Self, ChannelError> {
         let node = create_node()?;
         let services = Services {

@@ -1,4 +1,4 @@
-//! Time of the agent's work in one step at the paper's size: 64 x 64 cells, 64 moves, 3 states.
+//! Benchmarks of an agent's work in one step, at the paper's size: 64 x 64 cells, 64 moves, 3 states.
 //!
 //! For comparison, the authors' PyTorch code on one CPU thread takes 1.5 s for 2048 samples and 0.12 ms for a Bayes
 //! update.
@@ -114,7 +114,7 @@ fn estimators(c: &mut Criterion) {
     for (name, estimator) in estimators {
         let mut frames = frames.iter().cycle();
         c.bench_function(name, |b| {
-            b.iter(|| advance(estimator, black_box(frames.next().expect("a circle"))));
+            b.iter(|| advance(estimator, black_box(frames.next().expect("endless"))));
         });
     }
     c.bench_function("entropy", |b| {

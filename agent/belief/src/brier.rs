@@ -5,8 +5,9 @@ use emberwatch_model::Grid;
 
 /// Computes the Brier score of one state: the mean over all cells of `(p - 1[x = target])^2`.
 ///
-/// `p` is the belief in the state, which is number `target` in `truth` and number `own` in the belief. A perfect belief
-/// scores 0. If a share `q` of the cells is in the state, the belief `p = q` in every cell scores `q (1 - q)`.
+/// `p` is the believed probability of the state. The state has index `target` in `truth` and index `own` in the belief.
+/// A perfect belief scores 0. If a fraction `q` of the cells is in the state, a belief with `p = q` in every cell
+/// scores `q (1 - q)`.
 pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize) -> f64 {
     let squared = |(&p, &state): (&f32, &u8)| {
         let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
@@ -16,12 +17,13 @@ pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize)
     sum / truth.len() as f64
 }
 
-/// Computes the log loss: the mean over all cells of `-ln p` in nats, where `p` is the belief in the cell's true state.
+/// Computes the log loss: the mean over all cells of `-ln p` in nats, where `p` is the believed probability of the
+/// cell's true state.
 ///
 /// Infinite if some `p` is 0.
 ///
 /// # Panics
-/// If a true state is not below the belief's number of states.
+/// If `truth` contains a state that the belief lacks.
 pub fn log_loss(belief: &Belief, truth: &Grid<u8>) -> f64 {
     let log = |((row, col), &state): ((usize, usize), &u8)| {
         let probability = belief.probabilities()[[usize::from(state), row, col]];
@@ -32,8 +34,7 @@ pub fn log_loss(belief: &Belief, truth: &Grid<u8>) -> f64 {
     0.0 - sum / truth.len() as f64
 }
 
-/// Computes the share of cells whose most probable state is the true state. Among equally probable states, the first
-/// counts.
+/// Computes the fraction of cells whose most probable state is the true state. Ties go to the first state.
 pub fn accuracy(belief: &Belief, truth: &Grid<u8>) -> f64 {
     let numbers = belief.as_slice();
     let is_right = |&(index, &state): &(usize, &u8)| {
@@ -51,7 +52,7 @@ mod tests {
     use emberwatch_model::Shape;
 
     #[test]
-    fn scores_are_about_the_true_state() {
+    fn scores_compare_the_belief_with_the_true_states() {
         let truth = ndarray::arr2(&[[2, 0, 1, 0]]);
         let other = ndarray::arr2(&[[2, 1, 1, 0]]);
         let certain = Belief::from_states(&truth, 3).expect("test states");
@@ -63,7 +64,7 @@ mod tests {
         let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
         assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
         assert!((log_loss(&uniform, &truth) - 3.0_f64.ln()).abs() < 1e-6);
-        // All states tie, so state 0 counts: the true state of half the cells.
+        // All states tie, so state 0 is chosen. It is the true state of half the cells.
         assert_eq!(accuracy(&uniform, &truth), 0.5);
     }
 }

@@ -1,6 +1,6 @@
-//! The figures of merit of one run that are common in the field, as defined in `docs/figures-of-merit.md`.
+//! Common figures of merit of one run, as defined in `docs/figures-of-merit.md`.
 //!
-//! They need no model, only the number of the target state. Two of them also need the hidden states.
+//! They need no model, only the index of the target state. Two figures also need the hidden states.
 
 use emberwatch_model::path::Flight;
 use emberwatch_model::{Cell, Grid, Shape};
@@ -15,13 +15,13 @@ pub struct Merit {
     pub steps_to_detection: Option<u64>,
     /// Number of burning cells of the world at that step.
     pub burning_cells_at_detection: Option<u32>,
-    /// Share of the burning cells that a robot visited in the last [`MeritTally::recent_steps()`], as the mean over
-    /// steps with fire.
+    /// Fraction of the burning cells that a robot visited in the last [`MeritTally::recent_steps()`] steps, averaged
+    /// over steps with fire.
     pub burning_seen_share: Option<f64>,
-    /// Number of moves from the nearest robot to the nearest burning cell that no robot visited recently, as the mean
-    /// over steps with such a cell.
+    /// Number of moves from the nearest robot to the nearest burning cell that no robot visited recently, averaged over
+    /// steps with such a cell.
     pub front_distance: Option<f64>,
-    /// Share of all cells that any robot visited during the run.
+    /// Fraction of all cells that any robot visited during the run.
     pub grid_seen_share: f64,
 }
 
@@ -57,7 +57,7 @@ struct Mean {
 }
 
 impl MeritTally {
-    /// Creates the tally before the first step. `target` is the burning state, and `recent_steps` is at least 1.
+    /// Creates the tally before the first step. `target` is the burning state, and `recent_steps` must be at least 1.
     pub fn new(shape: Shape, target: u8, recent_steps: u32) -> Self {
         Self {
             shape,
@@ -72,8 +72,8 @@ impl MeritTally {
         }
     }
 
-    /// Adds a step: one flight for each of at least one robot, the reward counts, and the hidden states that the robots
-    /// met, shape `[H, W]`, if they are known.
+    /// Adds a step. `flights` contains the flight of each robot, and at least one. `states` are the hidden states
+    /// during the flights, shape `[H, W]`, if they are known.
     pub fn update(&mut self, flights: &[Flight], found: Found, states: Option<&Grid<u8>>) {
         self.step += 1;
         for &cell in flights.iter().flat_map(|flight| &flight.visited) {
@@ -184,7 +184,7 @@ mod tests {
         }
     }
 
-    /// Computes the figures of a run. Each step has the world, and the cells that each robot visits.
+    /// Computes the figures of a run. Each step consists of the world and the cells that each robot visits.
     fn merit(recent_steps: u32, steps: &[(&str, &[&[usize]])]) -> Merit {
         let shape = Shape::new(1, steps[0].0.len()).expect("test shape");
         let mut tally = MeritTally::new(shape, FIRE, recent_steps);
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn fire_is_detected_by_the_first_visit_to_a_cell_that_burns_then() {
+    fn detection_is_the_first_visit_to_a_burning_cell() {
         let of = |it: Merit| (it.steps_to_detection, it.burning_cells_at_detection);
         // Cell 1 is visited before it burns, then missed. Cell 2 is found when two cells burn.
         let steps: [(&str, &[&[usize]]); 3] =
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_are_seen_for_the_last_steps_alone() {
+    fn only_recent_visits_count_as_seen() {
         let steps: [(&str, &[&[usize]]); 3] =
             [("#..#", &[&[0]]), ("#..#", &[&[1]]), ("#..#", &[&[2]])];
         // One of two burning cells is seen: in all 3 steps, in the first two, or in the first. The nearest unseen fire
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn the_robots_of_a_team_see_together() {
+    fn visits_of_all_robots_count_together() {
         let got = merit(9, &[("#....#.#", &[&[0, 1], &[4, 5]])]);
         let expected = Merit {
             steps_to_detection: Some(1),
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn without_hidden_states_the_rest_is_measured() {
+    fn figures_without_hidden_states_are_still_measured() {
         let shape = Shape::new(1, 4).expect("test shape");
         let mut tally = MeritTally::new(shape, FIRE, 1);
         let found = Found {
@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_of_some_cells_is_that_of_a_plain_scan() {
+    fn nearest_agrees_with_a_full_scan() {
         let shape = Shape::new(5, 7).expect("test shape");
         for seed in 0..100 {
             let drawn = |index: usize| emberwatch_model::randomness::split_mix(seed, index as u64);

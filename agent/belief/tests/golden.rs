@@ -1,6 +1,6 @@
 //! Comparison with results of the unmodified PyTorch code of the paper's authors (torch 2.15.0, CPU, one thread).
 //!
-//! The authors' beliefs have shape `[H, W, S]`, and so have the arrays in `data/`. The files are uncompressed copies of
+//! The authors' beliefs have shape `[H, W, S]`, and so do the arrays in `data/`. The files are uncompressed copies of
 //! the originals, because `ndarray-npy` then needs no codec:
 //!
 //! ```python
@@ -142,7 +142,7 @@ fn the_masked_posterior_agrees_along_a_path() {
     assert!(visited.next().is_none());
 }
 
-/// Returns the objective of a planner type of the reference for an action. The last action is entropy.
+/// Returns the objective for an action of one of the reference's planner types. The last action is entropy.
 fn objective(planner_type: usize, action: usize) -> Objective {
     const DEFAULT: usize = 0;
     const RANDOM: usize = 1; // number of distinct cells, whatever the action
@@ -157,16 +157,17 @@ fn objective(planner_type: usize, action: usize) -> Objective {
 /// Case A5: scores of every sample for three planner types and four actions, and the winners. The reference clamps the
 /// sums of the sampled moves. The test converts them to moves by which our robot visits the same cells.
 ///
-/// The reference writes the visit mask at `[position[1], position[0]]`. So its second coordinate is the row, and its
-/// basis (1,0), (-1,0), (0,1), (0,-1) is right, left, down, up. Its environment receives the same mask, so only the
-/// names of the axes are swapped.
+/// The reference writes the visit mask at `[position[1], position[0]]`. The second coordinate of a position is
+/// therefore the row, and the basis (1,0), (-1,0), (0,1), (0,-1) is right, left, down, up. The reference's environment
+/// receives the same mask, so only the names of the axes are swapped.
 ///
 /// With a zero probability, the reference's entropy is `0 * log 0 = NaN`. The reference multiplies the whole grid by
 /// the visit mask, so the score of every path is NaN, and `torch.argmax` returns the first NaN. Our entropy is 0 there.
 /// Case p3 checks that the reference has NaN exactly in this situation.
 ///
-/// Sums of up to 64 numbers between 1 and 2 in another order differ by up to 64 roundings of 128. This is 5e-4 in the
-/// worst case, and below 5e-5 in these data. If the reference's best two scores are that close, either may win.
+/// Summing up to 64 numbers between 1 and 2 in a different order changes the result by up to 64 rounding errors of a
+/// number near 128. This is 5e-4 in the worst case, and below 5e-5 in these data. If the reference's best two scores
+/// are that close, either may win.
 #[test]
 fn path_scores_and_winners_agree() {
     const TOLERANCE: f32 = 5e-5;

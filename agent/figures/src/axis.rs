@@ -1,10 +1,10 @@
-//! Linear axes with round ticks, and the placement of labels without overlaps.
+//! Linear and logarithmic axes with ticks at round values, and the placement of labels without overlaps.
 
-/// Minimum range of an axis, and maximum absolute value. Outside of these limits, axes are not exact enough.
+/// Minimum range of an axis, and maximum absolute value on it. Beyond these limits, ticks are not exact enough.
 const MIN_RANGE: f64 = 1e-200;
 const MAX_VALUE: f64 = 1e200;
 
-/// Whether a number can be drawn on an axis.
+/// Whether an axis can show a value.
 pub fn is_drawable(value: f64) -> bool {
     value.abs() <= MAX_VALUE
 }
@@ -32,7 +32,7 @@ impl Axis {
         let step = round_step((most - least) / n_ticks as f64);
         let (first, last) = ((least / step).floor() as i64, (most / step).ceil() as i64);
         let ticks = (first..=last).map(|tick| tick as f64 * step).collect();
-        // Enough decimals to show the step exactly, which is 1, 2, 2.5 or 5 times a power of ten.
+        // Enough decimals to show the step exactly. The step is 1, 2, 2.5 or 5 times a power of ten.
         let exact = |decimals: &usize| {
             let shifted = step * 10_f64.powi(*decimals as i32);
             (shifted - shifted.round()).abs() < 1e-6 * shifted
@@ -45,7 +45,7 @@ impl Axis {
         }
     }
 
-    /// Creates an axis from zero to exactly `n` > 0, with ticks at whole numbers, but not always at `n`.
+    /// Creates an axis from zero to exactly `n` (at least 1). Its ticks are whole numbers, not always including `n`.
     pub fn counting_to(n: usize, n_ticks: usize) -> Self {
         let most = n as f64;
         let mut axis = Self::covering(std::iter::once(most), n_ticks.min(n));
@@ -56,7 +56,7 @@ impl Axis {
         axis
     }
 
-    /// Creates an axis over decimal logarithms (which must be finite), with ticks at whole powers of ten.
+    /// Creates an axis for base-10 logarithms, which must be finite. Ticks are at whole powers of ten.
     pub fn of_powers(logarithms: impl Iterator<Item = f64>) -> Self {
         let (least, most) = logarithms.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), value| {
             (a.min(value), b.max(value))
@@ -76,7 +76,7 @@ impl Axis {
         }
     }
 
-    /// Returns the position of a value in the range: 0 at its start, 1 at its end.
+    /// Returns the position of a value on the axis: 0 at the start of its range, 1 at the end.
     pub fn fraction(&self, value: f64) -> f64 {
         let (first, last) = self.range;
         (value - first) / (last - first)
@@ -103,12 +103,12 @@ fn round_step(step: f64) -> f64 {
     factor.unwrap_or(10.0) * power
 }
 
-/// Moves positions so that neighbours are at least `gap` apart, and all positions are in `least..=most` if they fit.
-/// The sum of squared movements is minimal. Equal positions keep their order.
+/// Moves positions so that neighbours are at least `gap` apart, and that all lie in `least..=most` if they fit.
+/// Minimises the sum of squared displacements. Equal positions keep their order.
 pub fn spread(positions: &[f64], gap: f64, (least, most): (f64, f64)) -> Vec<f64> {
     let mut order: Vec<usize> = (0..positions.len()).collect();
     order.sort_by(|&a, &b| positions[a].total_cmp(&positions[b]));
-    // After subtracting the gaps, this is an isotonic regression: merge neighbours that are out of order.
+    // After subtracting the gaps, this is isotonic regression: merge neighbours that are out of order.
     let mut pools: Vec<(f64, usize)> = Vec::new();
     for (rank, &index) in order.iter().enumerate() {
         let mut pool = (positions[index] - gap * rank as f64, 1);
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_of_extreme_numbers_stay_short() {
+    fn labels_of_extreme_values_stay_short() {
         for (value, label) in [(1e9, "2e8"), (1.2e-9, "2.5e-10"), (4e199, "1e199")] {
             let axis = Axis::covering(std::iter::once(value), 5);
             assert_eq!(
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn powers_of_ten_have_ticks() {
+    fn logarithmic_axes_have_ticks_at_powers_of_ten() {
         let axis = Axis::of_powers([-3.6, -2.1].into_iter());
         assert_eq!(axis.ticks, [-4.0, -3.0, -2.0]);
         assert_eq!(axis.fraction(-3.0), 0.5);

@@ -4,7 +4,7 @@ use crate::palette::sequential;
 use ndarray::ArrayView2;
 use png::{BitDepth, ColorType, Encoder, EncodingError};
 
-/// Minimum length of a picture's shorter side in pixels, unless cells would exceed [`MAX_PIXELS_PER_CELL`].
+/// Minimum length of an image's shorter side in pixels, unless cells would exceed [`MAX_PIXELS_PER_CELL`].
 const MIN_SIDE: usize = 256;
 const MAX_PIXELS_PER_CELL: usize = 16;
 
@@ -46,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_grid_is_dark_where_it_is_certain() {
+    fn certain_cells_are_dark() {
         let grid = ndarray::arr2(&[[0.0, 1.0, f32::NAN]]);
         let heat = heat(grid.view()).expect("a picture");
         assert_eq!((heat.height, heat.width), (16, 48));

@@ -1,4 +1,4 @@
-//! The ladder chart: one bar per row, with an interval and a dot for every world.
+//! The ladder chart: one bar per row, with an error bar and one dot per world.
 
 use crate::axis::{Axis, is_drawable};
 use crate::palette::{Color, GRID, INK, PAPER, blend};
@@ -8,11 +8,11 @@ use std::collections::BTreeSet;
 
 const ROW: f64 = 44.0;
 const BAR: f64 = 26.0;
-/// Upper edge of the bars, below title, note and legend.
+/// Upper edge of the bars, below the title, note and legend.
 const TOP: f64 = 132.0;
 /// Height of the tick labels and the axis label.
 const BOTTOM: f64 = 72.0;
-/// Maximum widths of a row's label and of its value. Longer texts are shortened.
+/// Maximum widths of a row's label and of its value. Longer text is shortened.
 const MAX_LABEL: f64 = 360.0;
 const MAX_VALUE: f64 = 200.0;
 
@@ -22,16 +22,16 @@ pub struct Ladder {
     /// A line of small print below the title.
     pub note: String,
     pub axis: String,
-    /// Names of the colours. They must fit on one line.
+    /// Name and colour of each legend entry. All entries must fit on one line.
     pub legend: Vec<(&'static str, Color)>,
     pub bars: Vec<Bar>,
 }
 
-/// A row of the chart. Values that are not finite are not drawn: if `value` is NaN, only the worlds are drawn.
+/// A row of the chart. Non-finite values are omitted: if `value` is NaN, only the dots of the worlds are drawn.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bar {
     pub name: String,
-    /// Small text after the name. It may be empty.
+    /// Small print after the name. It can be empty.
     pub remark: String,
     pub label: String,
     pub color: Color,
@@ -42,7 +42,7 @@ pub struct Bar {
     pub worlds: Vec<(u64, f64)>,
 }
 
-/// The area of the bars on the page.
+/// The plot area of the page, which contains the bars.
 struct Plot {
     left: f64,
     right: f64,
@@ -145,14 +145,14 @@ impl Bar {
 
     fn draw_worlds(&self, page: &mut Svg, plot: &Plot, upper: f64) {
         let dot = blend(self.color, INK, 0.55);
-        // With a single world, its dot would coincide with the end of the bar.
+        // The dot of a single world is omitted, because it would coincide with the end of the bar.
         let worlds = if self.worlds.len() > 1 || !is_drawable(self.value) {
             &self.worlds[..]
         } else {
             &[]
         };
         for &(seed, value) in worlds.iter().filter(|world| is_drawable(world.1)) {
-            // A world has the same height in all bars, so that it can be compared.
+            // A world's dot is at the same height in every bar, so that its values can be compared.
             let rank = plot.seeds.binary_search(&seed).unwrap_or(0) as f64 + 0.5;
             let at = (plot.x(value), upper + BAR * rank / plot.seeds.len() as f64);
             page.disc(at, 3.5, PAPER);

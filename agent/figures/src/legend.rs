@@ -1,4 +1,4 @@
-//! The legend of a snapshot, and its marks.
+//! The legend of a snapshot, and the marks that it explains.
 
 use crate::palette::{Color, INK, MUTED, PAPER};
 use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
@@ -24,8 +24,8 @@ enum Mark {
     Robot,
 }
 
-/// Draws the legend at `corner`. Each group of marks begins a new line. If states and observations are equal, they form
-/// one group. Returns the height of the legend.
+/// Draws the legend at `corner`. Each group of marks begins on a new line. If states and observations have the same
+/// names and colours, they form one group. Returns the height of the legend.
 pub fn draw_legend(
     page: &mut Svg,
     states: &[Named],
@@ -53,7 +53,7 @@ pub fn draw_legend(
     middle - top
 }
 
-/// Returns the marks with their names, by group.
+/// Returns the marks and their names, grouped.
 fn groups(states: &[Named], observations: &[Named], unobserved: Color) -> Vec<Vec<(Mark, String)>> {
     let group = |heading: &str, named: &[Named]| {
         let heading = (Mark::Heading, heading.to_owned());
@@ -111,12 +111,12 @@ impl Mark {
     }
 }
 
-/// Draws a path of horizontal and vertical legs. `rim` is the width of its white rim, in points.
+/// Draws a path of horizontal and vertical segments. `rim` is the width of its white rim, in points.
 pub fn draw_path(page: &mut Svg, points: &[Point], width: f64, rim: f64) {
     for (half, color) in [(width / 2.0 + rim, PAPER), (width / 2.0, INK)] {
         for ends in points.windows(2) {
             let ((x0, y0), (x1, y1)) = (ends[0], ends[1]);
-            // Legs run along rows or columns, so that rectangles avoid blurred edges.
+            // Segments run along rows or columns, so they are drawn as rectangles, whose edges are sharp.
             let from = (x0.min(x1) - half, y0.min(y1) - half);
             page.rectangle(from, (x0.max(x1) + half, y0.max(y1) + half), color);
         }

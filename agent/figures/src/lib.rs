@@ -1,11 +1,11 @@
 //! Charts: data in, SVG out, identical on every machine.
 //!
-//! [`Ladder`] draws bars, [`Lines`] curves over a common axis, and [`Snapshot`] the cells of one step. `svg` has the
-//! drawing functions, and `axis` the scales. [`heat`] creates PNG files for TensorBoard, which does not show SVG.
+//! [`Ladder`] draws bars, [`Lines`] curves over a common axis, and [`Snapshot`] the cells of one step. `svg` contains
+//! the drawing functions, and `axis` the scales. [`heat`] creates PNGs for TensorBoard, which cannot show SVG.
 
 #![allow(
     missing_docs,
-    reason = "serves one program: only names that need an explanation have one"
+    reason = "serves one program: only items that need an explanation are documented"
 )]
 
 mod axis;

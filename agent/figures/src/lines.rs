@@ -5,10 +5,10 @@ use crate::palette::{Color, GRID, INK, LINES, MUTED, SHADE, blend};
 use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
 
-/// Maximum number of curves per panel, which is the number of colours.
+/// Maximum number of curves per panel: the number of available colours.
 pub const MAX_CURVES: usize = LINES.len();
 
-/// Height of a panel with its title, if there are several panels and if there is only one.
+/// Height of a panel including its title: one of several panels, or the only panel.
 const PANEL: f64 = 190.0;
 const ONLY_PANEL: f64 = 556.0;
 /// Height of the page's title, and of the axis below the last panel.
@@ -39,7 +39,7 @@ pub struct Lines {
     pub panels: Vec<Panel>,
 }
 
-/// Curves with a common unit.
+/// Curves that share a unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Panel {
     /// The quantity, with its unit.
@@ -54,14 +54,14 @@ pub struct Panel {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scale {
     Linear,
-    /// Decimal logarithms. Values without a logarithm are omitted.
+    /// Base-10 logarithmic. Values that are not positive are omitted.
     Logarithmic,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curve {
     pub name: String,
-    /// Points in the order of x. Points that are not finite are omitted.
+    /// Points in order of x. Non-finite points are omitted.
     pub points: Vec<(f64, f64)>,
     /// Half the height of the error band at each point. Empty if there is no band.
     pub errors: Vec<f64>,
@@ -85,7 +85,7 @@ impl Curve {
 }
 
 impl Lines {
-    /// Returns the page as SVG. `None` if there are no points.
+    /// Returns the page as SVG, or `None` if there are no points.
     pub fn svg(&self) -> Option<String> {
         let panels: Vec<Drawn<'_>> = self.panels.iter().filter_map(Drawn::of).collect();
         let last = panels
@@ -121,7 +121,7 @@ impl Lines {
     }
 }
 
-/// The common axis of all panels, and their size.
+/// The horizontal axis that all panels share, and the size of a panel.
 struct Frame {
     left: f64,
     right: f64,
@@ -156,12 +156,12 @@ struct DrawnCurve {
     name: String,
     color: Color,
     points: Vec<(f64, f64)>,
-    /// Lower and upper edge of the band.
+    /// The value of x, and the lower and upper edge of the error band there.
     band: Vec<(f64, [f64; 2])>,
 }
 
 impl DrawnCurve {
-    /// Extracts the drawable points and band edges of a curve. `None` if there are no drawable points.
+    /// Extracts the drawable points and band edges of a curve. Returns `None` if no point can be drawn.
     fn of(curve: &Curve, scale: Scale, color: Color) -> Option<Self> {
         let errors = curve
             .errors
@@ -300,7 +300,7 @@ impl<'a> Drawn<'a> {
         }
     }
 
-    /// Draws names at the curves' ends, with connecting lines. Names of close ends are moved apart.
+    /// Writes each curve's name next to its end, with a connecting line. Names that would overlap are moved apart.
     fn draw_names(&self, page: &mut Svg, frame: &Frame, ends: &[Point], (upper, lower): Point) {
         let heights: Vec<f64> = ends.iter().map(|end| end.1).collect();
         let gap = LABEL_GAP.min((lower - upper) / ends.len() as f64);

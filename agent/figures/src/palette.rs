@@ -1,4 +1,4 @@
-//! Colours of the figures on white. They are distinguishable with all common kinds of colour blindness.
+//! Colours of the figures, for a white background. They are distinguishable with all common kinds of colour blindness.
 
 use std::fmt::{self, Display, Formatter};
 
@@ -11,7 +11,7 @@ impl Display for Color {
     }
 }
 
-/// Text, error bars and the zero line.
+/// Colour of text, error bars and the zero line.
 pub const INK: Color = Color(0x33, 0x33, 0x33);
 
 pub const MUTED: Color = Color(0x66, 0x66, 0x66);
@@ -20,11 +20,11 @@ pub const GRID: Color = Color(0xe4, 0xe4, 0xe4);
 
 pub const PAPER: Color = Color(0xff, 0xff, 0xff);
 
-/// Shaded area behind curves.
+/// Colour of the shaded area behind curves.
 pub const SHADE: Color = Color(0xf7, 0xe6, 0xd8);
 
-/// Colours of lines in the order of use: Okabe and Ito (2008), but with brown instead of yellow, which is too light for
-/// a line on white.
+/// Colours of lines in order of use: Okabe and Ito (2008), but with brown instead of yellow, which is too light for a
+/// line on white.
 pub const LINES: [Color; 8] = [
     Color(0x00, 0x72, 0xb2),
     Color(0xd5, 0x5e, 0x00),
@@ -36,7 +36,7 @@ pub const LINES: [Color; 8] = [
     Color(0x8c, 0x51, 0x0a),
 ];
 
-/// ColorBrewer's YlGnBu (Apache-2.0), from light to dark. Its lightness falls evenly, so that it is readable in
+/// ColorBrewer's YlGnBu (Apache-2.0), from light to dark. Its lightness decreases evenly, so it is readable in
 /// greyscale.
 const SEQUENTIAL: [Color; 9] = [
     Color(0xff, 0xff, 0xd9),
@@ -53,7 +53,7 @@ const SEQUENTIAL: [Color; 9] = [
 /// Candidate greys for "not observed", in order of preference.
 const NEUTRALS: [u8; 4] = [0xe2, 0xb8, 0x80, 0x48];
 
-/// Squared distance at which two colours are clearly distinguishable: 60 of 255 in each channel.
+/// Squared RGB distance at which two colours are clearly distinguishable: 60 of 255 in each channel.
 const APART: i32 = 3 * 60 * 60;
 
 /// Returns the colour of a probability, light for 0 and NaN. Values outside of `0..=1` are clamped.

@@ -1,4 +1,4 @@
-//! The layout of equally large panels on a page, each with the cells of one grid, aligned to pixels.
+//! The layout of equally sized panels on a page. Each panel shows the cells of one grid, aligned to whole pixels.
 
 use crate::palette::Color;
 use crate::svg::{Run, Svg};
@@ -13,7 +13,7 @@ const GAP: f64 = 26.0;
 pub const TITLE_HEIGHT: f64 = 30.0;
 /// Minimum width of a panel's column in points, so that its title fits.
 const MIN_WIDTH: f64 = 190.0;
-/// Target height of all panels together in points, as long as rows are not below [`MIN_HEIGHT`].
+/// Target height of all panels together in points, unless panels would become lower than [`MIN_HEIGHT`].
 const PAGE_HEIGHT: f64 = 860.0;
 /// Minimum height of a panel in points, which takes precedence over [`PAGE_HEIGHT`].
 const MIN_HEIGHT: f64 = 130.0;
@@ -21,14 +21,14 @@ const MIN_HEIGHT: f64 = 130.0;
 /// Maximum length of a panel's longer side in points. Larger panels would not show more detail.
 const MAX_SIDE: f64 = 540.0;
 
-/// The number of pixels per cell side, or the number of cells per pixel side.
+/// The scale of cells: pixels per cell side, or for large grids, cells per pixel side (`stride`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Zoom {
     pixels: usize,
     stride: usize,
 }
 
-/// Panels of equal size in rows.
+/// Panels of equal size, arranged in rows and columns.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Layout {
     shape: (usize, usize),
@@ -40,8 +40,8 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Returns the layout with the largest cells within `width` points. With equal cells, it prefers three columns, and
-    /// then fewer rows.
+    /// Returns the layout with the largest cells within `width` points. Among layouts with equally large cells, it
+    /// prefers three columns, and then fewer rows.
     pub fn new(shape: (usize, usize), n_panels: usize, (left, width): (f64, f64)) -> Self {
         let most = ((width + GAP) / (MIN_WIDTH + GAP)) as usize;
         let candidates = (1..=most.clamp(1, n_panels)).map(|columns| {
@@ -74,7 +74,7 @@ impl Layout {
         rows * (TITLE_HEIGHT + self.panel_size().1 + GAP) - GAP
     }
 
-    /// Returns the width of a column in points, for a panel and its title.
+    /// Returns the width of a column, which contains a panel and its title, in points.
     pub fn room(&self) -> f64 {
         self.panel_size().0.max(MIN_WIDTH)
     }
@@ -99,7 +99,7 @@ impl Layout {
         (points(self.shape.1), points(self.shape.0))
     }
 
-    /// Returns the side of a cell in points.
+    /// Returns the side length of a cell in points.
     pub fn cell_size(&self) -> f64 {
         self.zoom.pixels as f64 / self.zoom.stride as f64 / SCALE
     }
@@ -110,8 +110,8 @@ impl Layout {
         (corner.0 + middle(col), corner.1 + middle(row))
     }
 
-    /// Fills each cell (row, column) of a panel at `corner` with its colour. Large grids are reduced by nearest
-    /// neighbour, so that all colours are in the legend.
+    /// Fills each cell (row, column) of a panel at `corner` with its colour. Large grids are downsampled by nearest
+    /// neighbour, which creates no colours outside the legend.
     pub fn fill(&self, page: &mut Svg, corner: (f64, f64), color: impl Fn(usize, usize) -> Color) {
         let Zoom { pixels, stride } = self.zoom;
         let side = pixels as f64 / SCALE;

@@ -1,5 +1,5 @@
 //! A snapshot of one step, as in the paper: the hidden states, the observations of all cells, the observations along
-//! the path, and the belief in each state, if there is a belief.
+//! the path, and, if there is a belief, the probability of each state.
 
 use crate::legend::{Named, draw_legend, draw_path, draw_robot, draw_start};
 use crate::palette::{Color, MUTED, sequential, unlike};
@@ -13,7 +13,7 @@ const LEGEND_TOP: f64 = 76.0;
 /// Height of the colour bar below the panels.
 const FOOT: f64 = 84.0;
 const COLOR_BAR: f64 = 260.0;
-/// Minimum side of cells in points for a path with a white rim. Smaller cells would be hidden by it.
+/// Minimum side length of cells, in points, at which the path gets a white rim. The rim would hide smaller cells.
 const WIDE_CELL: f64 = 12.0;
 
 /// One step of one world, including its hidden states.
@@ -26,13 +26,13 @@ pub struct Snapshot<'a> {
     pub observations: Vec<Named>,
     /// The hidden state of each cell, shape `[H, W]`.
     pub truth: ArrayView2<'a, u8>,
-    /// The observation that the sensor would have made in each cell, shape `[H, W]`.
+    /// The observation that the sensor would make in each cell, shape `[H, W]`.
     pub observation: ArrayView2<'a, u8>,
     /// The robot's frame, shape `[H, W]`. Cells with 255, or another value without a name, were not observed.
     pub frame: ArrayView2<'a, u8>,
-    /// The robot's cells (row, column), the start first.
+    /// The cells (row, column) of the robot's path, beginning with its start.
     pub path: Vec<(usize, usize)>,
-    /// The name of each state in the belief, and its probabilities after the frame, shape `[H, W]`.
+    /// The name of each state, and its posterior probabilities given the frame, shape `[H, W]`.
     pub beliefs: Vec<(String, ArrayView2<'a, f32>)>,
 }
 

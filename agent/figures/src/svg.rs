@@ -1,4 +1,4 @@
-//! A white page for drawing, which becomes the text of an SVG file. Coordinates are points from the upper left corner.
+//! A white page to draw on, which is written as SVG text. Coordinates are in points from the upper left corner.
 
 use crate::palette::{Color, PAPER};
 use crate::text::{CAP_HEIGHT, FAMILY, TextStyle};
@@ -16,7 +16,7 @@ pub type Point = (f64, f64);
 /// A row of adjacent squares: the upper left corner of the first square, and the number of squares.
 pub type Run = (Point, usize);
 
-/// The part of a text at its horizontal position.
+/// The text anchor: the part of a text that is placed at its horizontal position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Align {
     Left,
@@ -61,7 +61,8 @@ impl Svg {
         )
     }
 
-    /// Fills a rectangle. Its edges are aligned to half points, which are whole pixels on a screen with two per point.
+    /// Fills a rectangle. Its edges are aligned to half points, which are whole pixels on a screen with two pixels per
+    /// point.
     pub fn rectangle(&mut self, from: Point, to: Point, color: Color) {
         let [left, top, right, bottom] = [from.0, from.1, to.0, to.1].map(on_pixel);
         if right > left && bottom > top {
@@ -98,7 +99,7 @@ impl Svg {
         }
     }
 
-    /// Fills a polygon. It is transparent if `opacity` is below 1.
+    /// Fills a polygon. It is translucent if `opacity` is below 1.
     pub fn polygon(&mut self, points: &[Point], color: Color, opacity: f64) {
         let points = list(points);
         self.add(format_args!(
@@ -136,7 +137,7 @@ impl Svg {
             Align::Center => at.0 - width / 2.0,
             Align::Right => at.0 - width,
         };
-        // The viewer stretches the text to the width of the layout, whatever its font.
+        // Viewers stretch the text to the width used in the layout, whichever font they have.
         let length = format!(
             " textLength=\"{}\" lengthAdjust=\"spacingAndGlyphs\"",
             short(width)
@@ -160,7 +161,7 @@ fn list(points: &[Point]) -> String {
     list
 }
 
-/// Rounds to two decimals. Numbers that are not finite become 0, so that the file remains valid.
+/// Rounds to two decimals. Non-finite values become 0, so that the file remains valid.
 fn short(number: f64) -> f64 {
     if number.is_finite() {
         (number * 100.0).round() / 100.0
@@ -194,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_are_none_reach_no_file() {
+    fn non_finite_values_are_not_written() {
         let mut page = Svg::new();
         let none = (f64::NAN, f64::INFINITY);
         page.line(&[none, none], 1.0, INK);

@@ -1,4 +1,4 @@
-//! Widths of texts. The layout uses the widths of Noto Sans. The SVG specifies each text's width, so that viewers with
+//! Text widths. The layout uses the widths of Noto Sans. The SVG specifies each text's width, so that viewers with
 //! another font stretch the text to fit.
 
 use crate::palette::{Color, INK, MUTED};
@@ -6,7 +6,7 @@ use crate::palette::{Color, INK, MUTED};
 /// Height of a capital letter as a fraction of the text size (Noto Sans, OS/2 table: 714 / 1000).
 pub const CAP_HEIGHT: f64 = 0.714;
 
-/// The font, and similar fonts for viewers that lack it.
+/// The preferred font, followed by similar fonts for viewers that lack it.
 pub const FAMILY: &str = "Noto Sans, Open Sans, DejaVu Sans, Arial, sans-serif";
 
 /// Replaces the end of a text that is too long.
@@ -63,7 +63,7 @@ impl TextStyle {
         Self { color, ..self }
     }
 
-    /// Returns the text as an SVG element. `at` and `more` are its position and further attributes.
+    /// Returns the text as an SVG element. `at` contains the attributes of its position, and `more` further attributes.
     pub fn element(self, at: &str, more: &str, text: &str) -> String {
         let (size, color) = (self.size, self.color);
         let weight = if self.is_bold {
@@ -89,7 +89,7 @@ impl TextStyle {
         f64::from(thousandths) / 1000.0 * self.size
     }
 
-    /// Shortens a text to `room` points. A shortened text ends with an ellipsis.
+    /// Shortens a text to at most `room` points. A shortened text ends with an ellipsis.
     pub fn fit(self, text: &str, room: f64) -> String {
         if self.width(text) <= room {
             return text.into();

@@ -1,4 +1,4 @@
-//! Charts of unusual data: they must be valid XML, and all texts must be on the page.
+//! Charts of unusual data: they must be valid XML, and all text must be on the page.
 
 use emberwatch_figures::{
     Bar, Color, Curve, Ladder, Lines, MAX_CURVES, Named, Panel, Scale, Shade, Snapshot,
@@ -48,7 +48,7 @@ fn ladder(bars: Vec<Bar>) -> Ladder {
 }
 
 #[test]
-fn ladders_of_none_one_and_many() {
+fn ladders_with_zero_one_and_many_bars() {
     for n_bars in [0, 1, 100] {
         let bars = (0..n_bars).map(|at| bar(&format!("policy {at}"), f64::from(at) - 50.0));
         let texts = check(&ladder(bars.collect()).svg());
@@ -62,7 +62,7 @@ fn ladders_of_none_one_and_many() {
 }
 
 #[test]
-fn a_row_without_a_value_has_its_worlds_alone() {
+fn a_row_without_a_value_shows_only_its_worlds() {
     let n_dots = |bar: Bar| ladder(vec![bar]).svg().matches("<circle").count();
     let mut row = bar("beam", 40.0);
     let of_two = n_dots(row.clone());
@@ -98,7 +98,7 @@ fn names_are_escaped_and_shortened() {
 }
 
 #[test]
-fn extreme_values_are_drawn_or_left_out() {
+fn extreme_values_are_drawn_or_omitted() {
     for value in [f64::NAN, f64::INFINITY, f64::MAX, f64::MIN_POSITIVE, -1e150] {
         let mut other = bar("error", 2.0);
         (other.ends, other.worlds) = (Some([0.0, 2.0 * value]), vec![(1, value), (2, 1.0)]);
@@ -134,7 +134,7 @@ fn lines(panels: Vec<Panel>) -> Lines {
 }
 
 #[test]
-fn panels_without_a_point_are_left_out() {
+fn panels_without_points_are_omitted() {
     let curve = |name: &str, y: f64| Curve::new(name, vec![(0.0, y), (1.0, y)]);
     assert_eq!(lines(Vec::new()).svg(), None);
     let none = panel("none", Scale::Logarithmic, vec![curve("negative", -1.0)]);
@@ -150,7 +150,7 @@ fn panels_without_a_point_are_left_out() {
 }
 
 #[test]
-fn there_are_as_many_curves_as_colours_and_one_point_is_seen() {
+fn extra_curves_are_omitted_and_single_points_are_drawn() {
     let curve = |at: usize| Curve::new(&format!("curve {at}"), vec![(1.0, 7.0)]);
     let all = panel("all", Scale::Linear, (0..20).map(curve).collect());
     let other = panel("one", Scale::Linear, vec![curve(20)]);
@@ -216,7 +216,7 @@ fn snapshots_show_each_cell_in_its_colour() {
     assert_eq!(step.truth, ndarray::arr2(&[[0, 0, 1], [2, 0, 0]]));
     let svg = snapshot(&step).svg();
     let document = Document::parse(&svg).expect("XML");
-    // In the first panel, the truth, equal neighbours in a row form one rectangle.
+    // In the first panel (the truth), adjacent cells of the same colour in a row form one rectangle.
     for (color, n_rectangles) in [("#0072b2", 2), ("#e6b43c", 1), ("#c8321e", 1)] {
         let is_of = |fill| fill == Some(color);
         let mut all = document.descendants().filter(|it| it.has_tag_name("path"));
@@ -227,7 +227,7 @@ fn snapshots_show_each_cell_in_its_colour() {
 }
 
 #[test]
-fn a_band_ends_where_its_scale_does() {
+fn a_logarithmic_band_omits_edges_that_are_not_positive() {
     let points = (0..10).map(|x| (f64::from(x), 1.0)).collect();
     let mut curve = Curve::new("rate", points);
     curve.errors = (0..10).map(|x| f64::from(x) / 4.0).collect();

@@ -47,10 +47,10 @@ pub fn named(name: &str) -> Option<&'static BeliefKind> {
     kinds.find(|kind| kind.name == name || kind.label == name)
 }
 
-/// Like [`named`], for the kinds that options can be learned on.
+/// Finds a kind as [`named`] does, but only among the kinds on which the choice of options can be learned.
 ///
-/// Frames update such a belief. It either knows the model or was learned, not both. Its learner does not choose
-/// objectives.
+/// Frames correct such a belief. The belief either knows the model or was learned, but not both. Its learner does not
+/// also learn which objective to plan for.
 ///
 /// # Errors
 /// If there is no such kind. The error lists the labels of all valid kinds.
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_and_labels_are_of_one_kind_each() {
+    fn each_name_and_label_identifies_one_kind() {
         for &kind in BELIEFS {
             assert_eq!(named(kind.name), Some(kind));
             assert_eq!(named(kind.label), Some(kind));
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn options_are_learned_on_what_frames_tell() {
+    fn options_are_learned_on_beliefs_that_frames_correct() {
         let labels = [
             "known_model, spatial_filter, second_order_filter, cavity_filter",
             "spatial_cavity_filter, learned_filter, learned_spatial_filter",

@@ -1,9 +1,9 @@
 //! Checkpoints: everything that a learner keeps between runs, in one safetensors file. Weights and the optimiser's
-//! moments are named tensors. Everything else is encoded by bincode in the byte tensor `state`.
+//! moments are named tensors. All other state is encoded with bincode in the byte tensor `state`.
 //!
-//! A checkpoint is written to a temporary file and renamed, so that readers find a complete file. The file records its
-//! learner and its format, and a digest reveals damaged values. Equal contents result in equal bytes, so that trainings
-//! can be compared by a hash of their checkpoints.
+//! A checkpoint is written to a temporary file and renamed, so that readers always find a complete file. The file
+//! records its kind of learner and its format, and contains a digest that reveals damage. Equal contents produce equal
+//! bytes, so training runs can be compared by the hashes of their checkpoints.
 
 use crate::config::AgentConfig;
 use crate::file::{Readers, replace_file};
@@ -36,13 +36,13 @@ const STATE: &str = "state";
 const FORM: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// Maximum size of a checkpoint in bytes, 200 times the size with a full replay buffer for 64 x 64 cells and 3 states.
+/// Maximum size of a checkpoint in bytes: 200 times its size with a full replay buffer for 64 x 64 cells and 3 states.
 const MAX_BYTES: u64 = 1 << 32;
 
-/// Maximum count, so low that increments cannot overflow.
+/// Maximum value of a saved counter, low enough that increments cannot overflow.
 const MAX_COUNT: u64 = 1 << 53;
 
-/// A well-formed file whose values differ from the written ones.
+/// The error for a well-formed file whose contents do not match its digest.
 #[derive(Debug, Error)]
 #[error("expected contents with digest {expected}, got {got}: the file is damaged")]
 pub struct WrongDigest {
@@ -80,13 +80,13 @@ impl Contents {
 
     pub fn set_state(&mut self, state: &impl Serialize) {
         let state = bincode::serde::encode_to_vec(state, FORM);
-        self.state = state.expect("invariant: states hold values and sequences of known length");
+        self.state = state.expect("invariant: states contain values and sequences of known length");
     }
 
-    /// Decodes the state as a learner's type.
+    /// Decodes the state into the learner's type `S`.
     pub fn state<S: DeserializeOwned>(&self) -> Result<S> {
         use bincode::serde::decode_from_slice as decode;
-        // The limit is a const parameter. Small files get a low limit, so that they cannot request much memory.
+        // The memory limit is a const parameter. It is low for small files, so that they cannot exhaust memory.
         let decoded = match self.state.len() {
             0..0x1_0000 => decode(&self.state, FORM.with_limit::<0x10_0000>()),
             0x1_0000..0x100_0000 => decode(&self.state, FORM.with_limit::<0x1000_0000>()),
@@ -102,7 +102,7 @@ impl Contents {
     /// Returns the values of a tensor.
     ///
     /// # Errors
-    /// If the tensor is missing, has another shape, or has values that are not finite.
+    /// If the tensor is missing, has a different shape, or contains non-finite values.
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         let tensor = self.tensors.get(name);
         let tensor =
@@ -121,7 +121,7 @@ impl Contents {
         }
     }
 
-    /// Checks that mean squares, whose roots are computed later, are not negative.
+    /// Checks that no mean square is negative, because optimisers compute its square root.
     pub fn check_squares(&self) -> Result<()> {
         let ends = [".second_moment", "running_var"];
         let is_square = |name: &str| {
@@ -141,7 +141,7 @@ impl Contents {
         config.map_err(|error| wrong(SETTINGS, "the settings of an agent", error))
     }
 
-    /// Returns a checksum of all contents. It reveals damage, not manipulation.
+    /// Returns a checksum of all contents. It reveals accidental damage, but not manipulation.
     pub fn digest(&self) -> String {
         let mut digest = crc32fast::Hasher::new();
         for (name, Tensor { shape, numbers }) in &self.tensors {
@@ -162,7 +162,7 @@ pub struct Part<'a> {
 }
 
 impl Part<'_> {
-    /// Returns the tensors whose names continue with a further prefix.
+    /// Returns the tensors of this part whose names begin with a further prefix.
     pub fn part(&self, prefix: &str) -> Self {
         Self {
             contents: self.contents,
@@ -170,7 +170,7 @@ impl Part<'_> {
         }
     }
 
-    /// Returns the values of a tensor, like [`Contents::tensor`].
+    /// Returns the values of a tensor of this part, with the same checks as [`Contents::tensor`].
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         self.contents
             .tensor(&format!("{}{name}", self.prefix), expected)
@@ -190,7 +190,7 @@ impl Part<'_> {
 pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
     let of_file = || format!("checkpoint {}", path.display());
     let bytes = encode(kind, contents).with_context(of_file)?;
-    // It contains beliefs about worlds, which are private to their owner.
+    // Only the owner may read the file, because it contains beliefs about worlds.
     replace_file(path, &bytes, Readers::Owner).with_context(of_file)
 }
 
@@ -239,7 +239,7 @@ pub fn encode(kind: &str, contents: &Contents) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Returns the format of a kind's state. In format 5, each transition of a DQN has its own discount.
+/// Returns the format of a kind of checkpoint. In format 5, each transition of a DQN stores its own discount.
 fn version(kind: &str) -> &'static str {
     match kind {
         "autoencoder" | "decisions" => "5",
@@ -247,7 +247,7 @@ fn version(kind: &str) -> &'static str {
     }
 }
 
-/// Sorts the header by name: safetensors writes metadata in the random order of a hash map. The length is unchanged.
+/// Sorts the header by key, because safetensors writes metadata in the random order of a hash map. Keeps the length.
 fn sort_header(file: &mut [u8]) {
     type Header = BTreeMap<String, BTreeMap<String, serde_json::Value>>;
     const WRITTEN: &str = "invariant: safetensors wrote a header of its length";
@@ -307,7 +307,7 @@ fn damaged(error: SafeTensorError) -> anyhow::Error {
     anyhow!("expected a complete safetensors file, got a damaged or truncated one: {error}")
 }
 
-/// Returns an error about a field unless `fits`.
+/// Returns an error about a field if `fits` is false.
 pub fn check(fits: bool, name: &str, expected: impl Display, got: impl Display) -> Result<()> {
     ensure!(fits, wrong(name, expected, got));
     Ok(())
@@ -324,7 +324,7 @@ pub fn check_counts(counts: &[(&str, u64)]) -> Result<()> {
     counts.try_for_each(|&(name, count)| check(count <= MAX_COUNT, name, &expected, count))
 }
 
-/// Checks that there are `length` numbers, all of them finite.
+/// Checks that there are exactly `length` values, and that all of them are finite.
 pub fn check_numbers<T: Copy + Into<f64>>(name: &str, numbers: &[T], length: usize) -> Result<()> {
     let mut floats = numbers.iter().map(|&number| number.into());
     let wrong = floats.find(|number: &f64| !number.is_finite());
@@ -365,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
+    fn written_checkpoints_are_read_back() {
         let (folder, path) = place();
         std::fs::write(&path, "open to everybody").expect("written");
         write(&path, "tests", &contents()).expect("written");
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_contents_are_equal_bytes() {
+    fn equal_contents_encode_to_equal_bytes() {
         let mut other = contents();
         let kernel = other.tensors.remove("kernel").expect("a tensor");
         other
@@ -404,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn every_cut_and_every_flipped_byte_is_refused_by_name() {
+    fn truncated_and_corrupted_files_are_rejected() {
         let (_folder, path) = place();
         write(&path, "tests", &contents()).expect("written");
         let whole = std::fs::read(&path).expect("readable");
@@ -430,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn another_kind_format_tensor_or_state_is_named() {
+    fn errors_name_the_kind_format_tensor_or_state() {
         let whole = encode("tests", &contents()).expect("small");
         for (from, to, words) in [
             (

@@ -17,8 +17,8 @@ use toml::{Table, Value};
 /// Every setting with its default and meaning.
 const DEFAULTS: &str = include_str!("../agent.toml");
 
-/// The authors' settings that differ from the defaults: moves clamped after their sum, a uniform first belief, and
-/// constant step sizes for the autoencoder and the DQN.
+/// The authors' settings that differ from the defaults: positions clamped once after all moves are summed, a uniform
+/// first belief, and constant step sizes for the autoencoder and the DQN.
 const PAPER: &str = r#"
 shooting_integration = "clamp_sum"
 prior = "uniform"
@@ -48,7 +48,7 @@ pub struct AgentConfig {
     pub decisions: DecisionsConfig,
 }
 
-/// The known-model filter's first belief.
+/// The first belief of the known-model filter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PriorKind {
@@ -72,20 +72,20 @@ impl PriorKind {
 
 impl Default for AgentConfig {
     fn default() -> Self {
-        Self::from_toml("").expect("invariant: the defaults are settings")
+        Self::from_toml("").expect("invariant: the defaults are valid settings")
     }
 }
 
 impl AgentConfig {
     /// Returns the settings of the paper's authors.
     pub fn paper() -> Self {
-        Self::from_toml(PAPER).expect("invariant: the preset is settings")
+        Self::from_toml(PAPER).expect("invariant: the preset has valid settings")
     }
 
     /// Parses settings from TOML. Settings that the text omits keep their defaults.
     ///
     /// # Errors
-    /// If a setting is unknown or out of range. The error names the first one.
+    /// If a setting is unknown or out of range. The error names the first such setting.
     pub fn from_toml(text: &str) -> Result<Self> {
         let mut settings: Table = DEFAULTS.parse()?;
         replace(&mut settings, text.parse()?, "")?;
@@ -97,7 +97,7 @@ impl AgentConfig {
     /// Checks every setting.
     ///
     /// # Errors
-    /// If a setting is out of range. The error names the first one.
+    /// If a setting is out of range. The error names the first such setting.
     pub fn check(&self) -> Result<()> {
         let ranges = [
             ("beam_width", self.beam_width as f64, 1.0, 1e4),
@@ -131,7 +131,7 @@ impl AgentConfig {
     }
 }
 
-/// Overrides settings with settings of the same names. `section` is the prefix for errors.
+/// Overrides settings with the values in `by`. `section` is the prefix of the settings' names in errors.
 fn replace(settings: &mut Table, by: Table, section: &str) -> Result<()> {
     for (name, value) in by {
         match (settings.get_mut(&name), value) {
@@ -150,7 +150,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn settings_take_the_place_of_defaults_and_unknown_ones_are_named() {
+    fn settings_override_defaults_and_unknown_settings_fail() {
         let config = AgentConfig::from_toml("seed = 3\n[dqn]\nstep_size.rate = 1").expect("valid");
         assert_eq!((config.seed, config.dqn.step_size.rate), (3, 1.0));
         assert_eq!(config.dqn.step_size.power, 0.6);
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_settings_are_named() {
+    fn errors_name_invalid_settings() {
         for (settings, expected) in [
             ("beam_width = 0", "1 to 10000, got 0"),
             ("objective.beam_bonus = nan", "0 to 1000, got NaN"),

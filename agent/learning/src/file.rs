@@ -15,7 +15,7 @@ pub enum Readers {
     Owner,
 }
 
-/// Writes a temporary file next to `path` and renames it, so that readers find a complete file.
+/// Writes a temporary file next to `path` and renames it, so that readers always find a complete file.
 ///
 /// # Errors
 /// If the system reports an error. The error names the file, which remains unchanged.
@@ -27,7 +27,7 @@ pub fn replace_file(path: &Path, bytes: &[u8], readers: Readers) -> Result<()> {
             .and_then(|()| file.sync_all())
             .and_then(|()| std::fs::rename(&temporary, path));
         if written.is_err() {
-            // The first error is the one to report.
+            // Only the first error is reported.
             let _ = std::fs::remove_file(&temporary);
         }
         anyhow::Ok(written?)
@@ -35,10 +35,11 @@ pub fn replace_file(path: &Path, bytes: &[u8], readers: Readers) -> Result<()> {
     written().with_context(|| format!("write {}", path.display()))
 }
 
-/// Checks that [`replace_file`] can create its temporary file. Called before long computations whose result is saved.
+/// Checks that [`replace_file`] can create its temporary file. Call this before a long computation whose result will be
+/// saved.
 ///
 /// # Errors
-/// If it cannot. The error names the file and the system's reason.
+/// If the temporary file cannot be created. The error names the file and the system's reason.
 pub fn check_replaceable(path: &Path) -> Result<()> {
     let created = create_temporary(path, Readers::Owner);
     let checked = created.and_then(|(temporary, _)| Ok(std::fs::remove_file(temporary)?));
@@ -49,7 +50,7 @@ fn create_temporary(path: &Path, readers: Readers) -> Result<(PathBuf, File)> {
     let name = path.file_name().context("expected the name of a file")?;
     let name = format!(".{}.{}", name.display(), std::process::id());
     let temporary = path.with_file_name(name);
-    // An earlier process with the same ID may have left a file with other permissions.
+    // An earlier process with the same ID may have left a file with different permissions.
     let _ = std::fs::remove_file(&temporary);
     let mut options = OpenOptions::new();
     options.write(true).create_new(true);

@@ -8,7 +8,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     values: Vec<Arc<dyn Value>>,
-    /// The digest of each checkpoint, in the order of reading.
+    /// The digest of each checkpoint, in the order in which they were read.
     pub digests: Vec<String>,
 }
 
@@ -17,7 +17,7 @@ trait Value: Any + Debug + Send + Sync {}
 impl<T: Any + Debug + Send + Sync> Value for T {}
 
 impl Learned {
-    /// Returns the value of a type, if a checkpoint contained one.
+    /// Returns the value of type `T`, if a checkpoint contained one.
     pub fn get<T: Any>(&self) -> Option<&T> {
         let mut values = self.values.iter();
         values.find_map(|value| {
@@ -26,7 +26,7 @@ impl Learned {
         })
     }
 
-    /// Returns shared ownership of the value of a type, like [`Self::get`].
+    /// Returns the same value as [`Self::get`], with shared ownership.
     pub fn shared<T: Any + Send + Sync>(&self) -> Option<Arc<T>> {
         let mut values = self.values.iter();
         values.find_map(|value| {
@@ -35,7 +35,7 @@ impl Learned {
         })
     }
 
-    /// Stores a value, replacing a value of the same type. Returns whether the replaced value was different.
+    /// Stores a value, and drops any earlier value of the same type. Returns whether the dropped value was different.
     pub fn put<T: Any + Debug + Send + Sync + PartialEq>(&mut self, value: T) -> bool {
         let is_other = self.get::<T>().is_some_and(|before| *before != value);
         self.values.retain(|before| {

@@ -1,4 +1,5 @@
-//! Learners: agents that learn while they act. `train` drives them. Pure: frames in, paths out.
+//! Learners: agents that learn while they act. The command `train` runs them. They perform no I/O: frames go in, paths
+//! come out.
 //!
 //! Each kind of learner is a constant in its own file, and has an entry in [`LEARNERS`].
 
@@ -55,7 +56,7 @@ pub fn of_checkpoint(name: &str) -> Result<&'static LearnerKind> {
     })
 }
 
-/// Reads the learned values of some checkpoints, at most one of each kind. Networks compute on `device`.
+/// Reads the learned values from checkpoints, at most one checkpoint of each kind. Networks compute on `device`.
 pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>, device: &Device) -> Result<Learned> {
     let mut learned = Learned::default();
     for path in paths {

@@ -1,6 +1,6 @@
 //! Learning agents: estimators with networks, learners, decisions, their checkpoints, and policies, which combine a
-//! belief, a planner and a goal. Only checkpoints and cached first beliefs use files; the rest is pure: frames in,
-//! paths out.
+//! belief, a planner and a goal. Only checkpoints and cached first beliefs use files. Everything else performs no I/O:
+//! frames go in, paths come out.
 //!
 //! Each module uses only the modules below it in this list:
 //!
@@ -14,11 +14,11 @@
 //! - [`gradient`], [`replay`], [`reward`], [`checkpoint`] -- the parts of learners
 //! - [`config`] -- settings
 //! - [`mod@file`] -- files that are written completely or not at all
-//! - [`parallel`] -- computation for several worlds at once
+//! - [`parallel`] -- parallel computation for several worlds
 
 #![allow(
     missing_docs,
-    reason = "internals of the agent: only names that need an explanation have one"
+    reason = "internals of the agent: only items that need an explanation are documented"
 )]
 
 pub mod beliefs;

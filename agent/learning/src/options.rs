@@ -1,5 +1,5 @@
-//! Beliefs about single-robot worlds and the plans of all options, for a learner that chooses among the options.
-//! Pure: the caller flies the paths.
+//! Beliefs about single-robot worlds and the plans of all options, for an external learner that chooses an option. The
+//! caller flies the paths.
 
 use crate::beliefs::autoencoder::AutoencoderModel;
 use crate::beliefs::{BELIEFS, BeliefKind, Conditions, KNOWN, WorldForm};
@@ -15,7 +15,7 @@ use emberwatch_messages::agent_belief::Intent;
 use emberwatch_model::{Cell, Frame, Model, Shape};
 use std::time::{Duration, Instant};
 
-/// What all worlds share: the model, the belief's kind and learned values, and the planner's settings.
+/// The data that all worlds share: the model, the kind of belief with its learned values, and the planner's settings.
 pub struct Crew {
     model: Model,
     shape: Shape,
@@ -30,7 +30,7 @@ pub struct Planned {
     agent: Agent,
     /// In the order of [`emberwatch_belief::planning::OPTIONS`].
     proposals: Vec<Proposal>,
-    /// Planning time.
+    /// The time that the last planning took.
     planning: Duration,
 }
 
@@ -43,11 +43,12 @@ pub struct Shown {
 }
 
 impl Crew {
-    /// Creates the shared part. Without `estimator`, beliefs come from the checkpoint's estimator, or from the
-    /// known-model filter if there is no checkpoint.
+    /// Creates the shared data. If `estimator` is `None`, the checkpoint's estimator is used, or the known-model filter
+    /// if there is no checkpoint.
     ///
     /// # Errors
-    /// If the checkpoint lacks the estimator, or its worlds had another form. The message begins with `checkpoint`.
+    /// If the checkpoint lacks the estimator, or was trained in worlds of another form. The message begins with
+    /// `checkpoint`.
     pub fn new(
         estimator: Option<&'static BeliefKind>,
         learned: Learned,
@@ -68,7 +69,7 @@ impl Crew {
                 name: "options".into(),
                 belief: kind,
                 planner: &BY_OPTIONS,
-                // The external learner chooses the option.
+                // A placeholder: the external learner chooses the option.
                 goal: Goal::Rule,
             },
             model,
@@ -114,7 +115,8 @@ impl Crew {
     }
 }
 
-/// Returns the default belief: the belief of the learned decisions, otherwise the learned belief, otherwise [`KNOWN`].
+/// Returns the default kind of belief: the kind that learned decisions are based on, otherwise a learned kind,
+/// otherwise [`KNOWN`].
 pub fn usual(learned: &Learned) -> &'static BeliefKind {
     let decided = learned
         .get::<LearnedDecisions>()
@@ -134,7 +136,7 @@ impl Planned {
         Ok(())
     }
 
-    /// Predicts the beliefs about several worlds.
+    /// Predicts the beliefs about several worlds one step ahead.
     pub fn predict_all<'a>(all: impl IntoIterator<Item = &'a mut Self>) {
         Agent::predict_all(all.into_iter().map(|planned| &mut planned.agent));
     }
@@ -151,7 +153,7 @@ impl Planned {
         &self.proposals
     }
 
-    /// Records the flown option, and returns the intent that observers see.
+    /// Records the flown option, and returns the intent to publish to observers.
     pub fn intent(&mut self, flown: Option<usize>) -> Intent {
         if let Some(proposal) = flown.and_then(|index| self.proposals.get(index)) {
             self.agent
@@ -164,7 +166,8 @@ impl Planned {
         &self.agent
     }
 
-    /// Resumes from the belief that another agent handed over, like [`Agent::take_over`].
+    /// Resumes from the belief that another agent handed over. Returns false if the format `kind` or the bytes do not
+    /// fit.
     pub fn take_over(&mut self, kind: &str, bytes: &[u8]) -> bool {
         self.agent.handover_kind().is_some_and(|own| own == kind) && self.agent.take_over(bytes)
     }

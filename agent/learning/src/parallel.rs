@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-/// Runs tasks in parallel. Returns their results in order. A single task runs faster, on the calling thread.
+/// Runs tasks in parallel. Returns their results in order. A single task runs on the calling thread, which is faster.
 pub fn in_parallel<T: Send, U: Send>(
     tasks: impl IntoIterator<Item = T>,
     work: impl Fn(T) -> U + Sync,

@@ -1,9 +1,9 @@
 //! A replay buffer for sequences: recent frames of one or more robots, in blocks.
 //!
 //! A *track* is the sequence of frames of one robot in one episode, without gaps. It is divided into blocks of equal
-//! length; the last block may be shorter. A block stores the belief before its first frame, which a learner updates at
-//! the end of the preceding block. A block is replayed once it is full or its track has ended. When the buffer is full,
-//! the oldest blocks are dropped.
+//! length; the last block may be shorter. A block stores the belief before its first frame. A learner updates this
+//! belief whenever it has processed the preceding block. A block is replayed once it is full or its track has ended.
+//! When the buffer is full, the oldest blocks are dropped.
 
 use crate::checkpoint::{check, check_counts, check_numbers, wrong};
 use anyhow::Result;
@@ -24,7 +24,7 @@ pub struct Block {
     pub frames: Vec<Vec<Sighting>>,
     /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
     pub start: Option<Vec<f32>>,
-    /// The number of the next block on the track.
+    /// The number of the track's next block.
     next: u64,
 }
 
@@ -33,13 +33,13 @@ pub struct BlockReplay {
     block_length: usize,
     max_frames: usize,
     full: BTreeMap<u64, Block>,
-    /// The block that receives each robot's frames, by robot.
+    /// The block that receives new frames, for each robot.
     open: BTreeMap<u32, (u64, Block)>,
     n_opened: u64,
 }
 
 impl BlockReplay {
-    /// Creates a buffer for `max_frames` frames in blocks of at most `block_length`. It holds at least one block.
+    /// Creates a buffer for `max_frames` frames in blocks of at most `block_length`. At least one block is kept.
     pub fn new(block_length: usize, max_frames: usize) -> Self {
         Self {
             block_length,
@@ -50,7 +50,7 @@ impl BlockReplay {
         }
     }
 
-    /// Begins a new track of a robot, which ends its previous track.
+    /// Begins a new track for a robot, and ends the robot's previous track.
     pub fn begin(&mut self, robot: u32) {
         let block = self.new_block(None);
         if let Some((number, last)) = self.open.insert(robot, block)
@@ -80,7 +80,7 @@ impl BlockReplay {
         }
         block.frames.push(sightings);
         if block.frames.len() == self.block_length {
-            // An empty belief is a placeholder until the first frame of the block.
+            // An empty belief is a placeholder until the block receives its first frame.
             let following = self.new_block(Some(Vec::new()));
             let next = following.0;
             if let Some((id, mut block)) = self.open.insert(robot, following) {
@@ -94,17 +94,17 @@ impl BlockReplay {
         self.full.len()
     }
 
-    /// Returns the numbers of the full and ended blocks, oldest first.
+    /// Returns the numbers of the blocks that can be replayed, oldest first.
     pub fn blocks(&self) -> impl Iterator<Item = u64> + '_ {
         self.full.keys().copied()
     }
 
-    /// Returns a full or ended block, unless it was dropped.
+    /// Returns a block that can be replayed. `None` if it is still open or was dropped.
     pub fn block(&self, number: u64) -> Option<&Block> {
         self.full.get(&number)
     }
 
-    /// Stores the belief at the end of a block in the next block of its track.
+    /// Stores the belief at the end of a block as the start of the track's next block.
     pub fn hand_on(&mut self, number: u64, belief: &[f32]) {
         let Some(next) = self.full.get(&number).map(|block| block.next) else {
             return;
@@ -198,7 +198,7 @@ impl Block {
                 let dim = (n_states, shape.height(), shape.width());
                 check_numbers("replay.start", start, n_states * shape.n_cells())?;
                 let start = Probabilities::from_shape_vec(dim, start.to_vec());
-                let start = start.expect("invariant: as many numbers");
+                let start = start.expect("invariant: the length was checked");
                 let start = Belief::from_probabilities(start).map(drop);
                 start.map_err(|error| wrong("replay.start", "a belief", error))
             }
@@ -223,7 +223,7 @@ mod tests {
         Belief::from_probabilities(states).expect("valid")
     }
 
-    /// A buffer for 3 blocks of 2 frames, with frames of two worlds in turn.
+    /// A buffer for 3 blocks of 2 frames, with frames of two robots in alternation.
     fn replay(n_frames: u8) -> BlockReplay {
         let mut replay = BlockReplay::new(2, 7);
         replay.begin(0);
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_come_back_in_blocks_of_their_world_until_there_is_no_room() {
+    fn frames_are_stored_in_blocks_until_the_buffer_is_full() {
         let three = replay(3);
         assert_eq!(numbers(&three), [0, 1]);
         let block = three.block(1).expect("kept");
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn beliefs_are_handed_on_along_a_track() {
+    fn beliefs_are_passed_on_along_a_track() {
         let mut replay = replay(4);
         let start =
             |replay: &BlockReplay, number| replay.block(number).and_then(|it| it.start.clone());
@@ -295,7 +295,7 @@ mod tests {
         replay.hand_on(2, &[8.0]); // There is no next block.
         replay.begin(0);
         replay.begin(0);
-        assert_eq!(replay.blocks().last(), Some(4), "without frames no block");
+        assert_eq!(replay.blocks().last(), Some(4), "no block without frames");
         assert_eq!(resumed(replay.clone()).expect("whole"), replay);
     }
 
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn a_replay_goes_on_alike_and_the_newest_blocks_stay() {
+    fn a_resumed_buffer_is_equal_and_keeps_the_newest_blocks() {
         for n_frames in 0..9 {
             let mut before = replay(n_frames);
             let mut after = resumed(before.clone()).expect("whole");
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_replay_holds_is_named() {
+    fn errors_name_invalid_contents() {
         let check = |change: fn(&mut BlockReplay), words: &str| {
             let mut other = replay(5);
             change(&mut other);

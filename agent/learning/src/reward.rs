@@ -10,10 +10,10 @@ use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use serde::{Deserialize, Serialize};
 
-/// Weight of the earlier sums after each path, which corresponds to a memory of 2,000 paths.
+/// Decay factor of the accumulated sums per path. It corresponds to a memory of 2,000 paths.
 const KEPT: f64 = 0.9995;
 
-/// Ridge term on the diagonal, in squared cells. It makes the system solvable if a state was never visited.
+/// Ridge term on the diagonal, in squared cells. It makes the system solvable even if a state was never visited.
 const RIDGE: f64 = 1.0;
 
 /// Returns the expected number of visited cells in each state, under the posterior after the path's frame.
@@ -24,7 +24,7 @@ pub fn met(posterior: &Belief, visited: impl Iterator<Item = usize> + Clone) -> 
     planes.map(cells).collect()
 }
 
-/// An estimate of the reward of each state: the sums of the least-squares problem.
+/// An estimate of the reward of each state, stored as the sums of the least-squares problem.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RewardEstimate {
     /// `sum x x'`, shape `[S, S]`.
@@ -41,7 +41,7 @@ impl RewardEstimate {
         }
     }
 
-    /// Checks an estimate from a checkpoint: its shapes, and that its numbers are finite.
+    /// Checks an estimate from a checkpoint: its shapes, and that its values are finite.
     pub fn check(&self, n_states: usize) -> Result<()> {
         check_numbers("reward.products", &self.products, n_states * n_states)?;
         check_numbers("reward.rewards", &self.rewards, n_states)
@@ -84,7 +84,7 @@ impl RewardEstimate {
         solution
     }
 
-    /// Returns the state with the highest reward. `None` before any reward.
+    /// Returns the state with the highest estimated reward. `None` before the first reward.
     pub fn target(&self) -> Option<usize> {
         let rewards = self.of_states();
         let best = (0..rewards.len()).max_by(|&a, &b| rewards[a].total_cmp(&rewards[b]))?;

@@ -1,4 +1,5 @@
-//! An agent with its world, and the step that all commands share: plan, fly, see, predict. Pure.
+//! An agent with its world, and the step that all commands share: plan, fly, see, predict. All communication is behind
+//! [`Environment`].
 
 pub mod agent;
 pub mod building;
@@ -12,7 +13,7 @@ use emberwatch_messages::message::RobotResult;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::{Cell, Grid, Move};
 
-/// Runs one step in all worlds of an environment. Returns `None` if the environment was stopped before they moved.
+/// Runs one step in all worlds of an environment. Returns `None` if the environment was stopped before the step.
 ///
 /// # Errors
 /// If the environment cannot fly the paths, or a frame is impossible under a belief.
@@ -29,7 +30,7 @@ pub fn step(
     Ok(Some(records))
 }
 
-/// An acting part: one or more agents, or a learner.
+/// The decision maker of a step: one or more agents, or a learner.
 pub trait Actor {
     /// Plans the path of each robot for step k -> k + 1.
     fn plan(&mut self) -> Vec<Vec<Move>>;
@@ -53,13 +54,14 @@ pub trait Environment {
     fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>>;
 }
 
-/// An agent and its world's last observation. The agent plans for one robot, or for several robots on one belief.
+/// An agent and its world's last observation. The agent plans for one robot, or for several robots that share one
+/// belief.
 pub struct Rollout {
     pub agent: Agent,
     seen: Seen,
 }
 
-/// The observation of an agent.
+/// The observation that an agent receives.
 #[derive(Debug, Clone)]
 pub struct Seen {
     /// Observation of the agent's first robot. Its frame corrects the belief.
@@ -82,7 +84,7 @@ pub struct StepRecord {
 }
 
 impl Seen {
-    /// Combines the observations of an agent's robots in one world. There must be at least one.
+    /// Combines the observations of an agent's robots in one world. There must be at least one observation.
     pub fn new(observations: impl IntoIterator<Item = Observation>) -> Self {
         let mut observations = observations.into_iter();
         let first = observations.next();
@@ -95,12 +97,12 @@ impl Seen {
 }
 
 impl Rollout {
-    /// Creates a rollout. The observation has not corrected the agent's belief yet.
+    /// Creates a rollout, without correcting the agent's belief with the observation.
     pub fn new(agent: Agent, seen: Seen) -> Self {
         Self { agent, seen }
     }
 
-    /// Creates a rollout, corrects the belief with the observation, and predicts. The belief is then about X_{k+1}.
+    /// Creates a rollout, corrects the belief with the observation, and predicts it one step ahead.
     pub fn begun(agent: Agent, seen: Seen) -> Result<Self> {
         let mut rollout = Self::new(agent, seen);
         rollout.correct()?;
@@ -132,7 +134,7 @@ impl Rollout {
             observation, truth, ..
         } = &self.seen;
         self.agent.correct(&observation.frame, truth.as_ref())?;
-        // Nothing was flown before the first frame.
+        // There is no reward before the first path.
         if observation.world.step > 0 {
             self.agent.earn(observation.robot.reward);
         }

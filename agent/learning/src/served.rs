@@ -6,7 +6,7 @@ use emberwatch_messages::backend::Backend;
 use emberwatch_messages::client::Client;
 use emberwatch_model::Move;
 
-/// All robots of a client.
+/// The environment of all robots of a client.
 pub struct Served<'a, B> {
     client: &'a mut Client<B>,
     /// Whether frames show every cell.
@@ -19,7 +19,7 @@ impl<'a, B: Backend> Served<'a, B> {
         Self { client, shows_all }
     }
 
-    /// Returns the present observation of each agent.
+    /// Returns the current observation of each agent.
     ///
     /// # Errors
     /// If the backend does not answer.

@@ -74,7 +74,8 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
     }
 }
 
-/// Computes `-ln P` of frames by the definition, in f64. `tables` are kernel, likelihood and first belief.
+/// Computes `-ln P` of frames from its definition, in f64. `tables` are the kernel, the likelihood and the first
+/// belief.
 fn loss(
     dimensions: Dimensions,
     tables: &[Vec<f64>; 3],
@@ -106,7 +107,7 @@ fn loss(
     loss
 }
 
-/// Computes eqs. 2 and 3 by the definition.
+/// Computes eqs. 2 and 3 from their definitions.
 fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64]) -> Vec<f64> {
     let (n_states, (rows, cols)) = (dimensions.n_states, dimensions.kernel);
     let (n_cells, sees_own) = (shape.n_cells(), dimensions.sees_own_state);
@@ -224,7 +225,7 @@ fn a_window_ends_with_the_filters_prediction() {
 }
 
 #[test]
-fn learning_begins_alike_for_every_own_state() {
+fn initial_kernels_are_similar_for_every_own_state() {
     let prior = belief(3, shape(12, 40), 0);
     let [one, own] = [false, true].map(|sees_own_state| {
         let tables = Parameters::first(dimensions(sees_own_state), 0).tables();
@@ -232,7 +233,7 @@ fn learning_begins_alike_for_every_own_state() {
         filter.predict();
         filter.belief().clone()
     });
-    // The weights differ by a noise of 10 %.
+    // The weights differ by 10 % noise.
     assert!(off(&one, &own) < 0.05);
 }
 
@@ -314,7 +315,7 @@ fn training_waits_for_a_block_for_each_stream() {
 }
 
 #[test]
-fn a_number_that_is_not_finite_stops_training_by_name() {
+fn a_non_finite_parameter_stops_training_with_an_error() {
     let mut parameters = Parameters::first(dimensions(false), 0);
     parameters.tensors[1][4] = f32::NAN;
     let before = format!("{parameters:?}");

@@ -1,4 +1,4 @@
-//! Kernels that see the cell's own state, learned from frames of worlds that have such kernels.
+//! Learns kernels that see the cell's own state, from frames of a model with such kernels.
 
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
@@ -52,7 +52,7 @@ impl World {
         }
     }
 
-    /// A random path through the next states: what it saw, and where.
+    /// Flies a random path through the next states. Returns the frame and the visited cells.
     fn fly(&mut self, model: &Model, step: u64) -> (Frame, Vec<usize>) {
         self.dynamics.step(self.seed, 500 + step, &mut self.states);
         let random = |n: u64| split_mix(self.seed ^ (step << 32), n);
@@ -76,7 +76,7 @@ impl World {
     }
 }
 
-/// What a learner makes of random paths through worlds.
+/// Fits a filter to the frames of random paths.
 fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
     let mut config = AgentConfig::default();
     config.learning.steady_updates = 600;
@@ -107,8 +107,8 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
     learner.learned()
 }
 
-/// How far predictions of known states are from the true model's: the largest difference of probabilities, on
-/// average over the cells in each state and then over the states.
+/// Returns how far predictions from known states are from the true model's predictions: each cell's largest difference
+/// in probability, averaged over the cells in each state, and then over the states.
 fn distance(model: &Model, tables: &Tables) -> f64 {
     let mut dynamics = Dynamics::new(model, shape()).expect("a valid model");
     let (mut sums, mut counts) = ([0.0; 3], [0.0; 3]);

@@ -1,4 +1,4 @@
-//! The step of agents that plan for one or more robots.
+//! Steps of agents that plan for one or more robots.
 
 use emberwatch_belief::Belief;
 use emberwatch_learning::beliefs::Conditions;
@@ -16,7 +16,7 @@ fn shape() -> Shape {
     Shape::new(8, 9).expect("test shape")
 }
 
-/// The observation of robots in some cells of a made-up world.
+/// The observations of robots at the given cells of a made-up world.
 fn seen(step: u64, cells: &[Cell]) -> Seen {
     let mut frame = Frame::empty(shape());
     for cell in (0..72).filter(|cell| split_mix(step, *cell).is_multiple_of(4)) {
@@ -37,7 +37,7 @@ fn seen(step: u64, cells: &[Cell]) -> Seen {
     }))
 }
 
-/// An agent at the start of a made-up world, with robots at these cells.
+/// An agent at the start of a made-up world, with robots at the given cells.
 fn robot(policy: &str, cells: &[Cell]) -> Rollout {
     let model = Model::wildfire();
     let conditions = Conditions {
@@ -81,7 +81,7 @@ fn missed_steps_equal_steps_with_empty_frames() {
 }
 
 #[test]
-fn paths_come_by_robot_and_each_agent_sees_its_own() {
+fn agents_together_act_as_each_agent_alone() {
     let new = || {
         vec![
             robot("beam_exploit", &CELLS[..2]),
@@ -108,7 +108,7 @@ fn paths_come_by_robot_and_each_agent_sees_its_own() {
 }
 
 #[test]
-fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
+fn the_first_robot_of_a_team_flies_as_it_would_alone() {
     for policy in [
         "beam_exploit",
         "shooting_exploit",
@@ -119,7 +119,7 @@ fn one_robot_of_a_team_flies_as_if_there_were_no_team() {
         let mut team = robot(policy, &CELLS);
         let (own, of_team) = (alone.plan(), team.plan());
         assert_eq!((own.len(), of_team.len()), (1, 3), "{policy}");
-        // The beliefs are equal, so that the first robot alone has the same plan.
+        // The beliefs are equal, so the team's agent plans the same path for its first robot alone.
         let first = team.agent.plan(&CELLS[..1], team.step());
         assert_eq!(own, first, "{policy}");
     }

@@ -1,5 +1,5 @@
-//! Time of the networks at the paper's size, 64 x 64 cells. The autoencoder has windows of 1,000 frames and 16 hidden
-//! numbers.
+//! Benchmarks of the networks at the paper's size, 64 x 64 cells. The autoencoder uses windows of 1,000 frames and
+//! hidden vectors of length 16.
 //!
 //! For comparison, the authors' PyTorch code with two threads takes 1,156 to 1,240 ms for an update and 0.95 ms for an
 //! inference step.
@@ -28,7 +28,7 @@ fn shape() -> Shape {
     Shape::new(64, 64).expect("valid shape")
 }
 
-/// Returns the frame of a random walk of 64 moves: about 33 cells, in patches of one value.
+/// Returns the frame of a random walk of 64 moves: about 33 cells, whose observations form patches of equal values.
 fn path_frame(step: u64) -> Frame {
     let moves: Vec<Move> = (0..64)
         .map(|t| Move::from_low_bits(split_mix(step, t) >> 62))
@@ -138,8 +138,8 @@ fn flight_frame(step: u64) -> Frame {
     frame
 }
 
-/// Measures the neural belief as in training. An update uses 16 of 64 lessons (`neural.batch`): they fill a batch,
-/// because long flights need whole grids.
+/// Measures the neural belief as in training. An update uses 16 of the 64 lessons (`neural.batch`). These fill a batch,
+/// because long flights need crops of the whole grid.
 fn neural_belief(c: &mut Criterion) {
     let mut network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let (mut before, mut lessons) = (Sightings::new(shape()), Vec::new());

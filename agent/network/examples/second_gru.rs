@@ -1,7 +1,7 @@
 //! A network with an additional layer: a second GRU after the first.
 //!
-//! Candle computes its gradients, a seed determines its initial values, and [`Adam`] finds its variables by name. Run
-//! it with `cargo run --release -p emberwatch-network --example second_gru`
+//! Candle computes the network's gradients, a seed determines its initial values, and [`Adam`] finds its variables by
+//! name. Run the example with `cargo run --release -p emberwatch-network --example second_gru`
 
 use candle_core::{DType, Result, Tensor};
 use candle_nn::VarBuilder;

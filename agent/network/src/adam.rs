@@ -7,8 +7,9 @@ use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
-/// Added to moments and subtracted again. Moments of zero gradients then stop at a few rounding errors of this number.
-/// They never become subnormal numbers, which some processors handle a hundred times more slowly.
+/// A constant that is added to moments and subtracted again. If gradients stay zero, moments then stop decaying at a
+/// few rounding errors of this constant. They never become subnormal numbers, which some processors handle a hundred
+/// times more slowly.
 const FLUSH: f64 = 1e-30;
 
 /// Settings of Adam.
@@ -19,7 +20,7 @@ pub struct AdamSettings {
     pub learning_rate: f32,
     /// Decay rates of the two moments.
     pub betas: [f32; 2],
-    /// Added to the square root of the second moment.
+    /// A constant that is added to the square root of the second moment.
     pub epsilon: f32,
     /// Maximum Euclidean norm of all gradients together. Larger gradients are scaled down to it.
     pub max_norm: Option<f32>,
@@ -41,7 +42,7 @@ impl AdamSettings {
 #[derive(Debug, Clone)]
 pub struct Adam {
     variables: Variables,
-    /// `first.<name>` and `second.<name>`.
+    /// The two moments of each parameter, named `first.<name>` and `second.<name>`.
     moments: Variables,
     steps: u64,
 }
@@ -60,11 +61,11 @@ impl Adam {
         })
     }
 
-    /// Performs one step against the gradients of a loss, and returns the loss.
+    /// Performs one optimisation step on a loss, and returns the loss.
     ///
     /// # Errors
-    /// [`NetworkError`] names the first tensor, in the order of computation, with a number that is not finite. An error
-    /// changes nothing.
+    /// [`NetworkError`] if a value is not finite. The error names the first tensor that contains one, in the order of
+    /// computation. All variables are then unchanged.
     pub fn update(
         &mut self,
         settings: &AdamSettings,
@@ -73,8 +74,8 @@ impl Adam {
         self.update_with(settings, loss, Vec::new(), "")
     }
 
-    /// Like [`Self::update`], but also applies the changes in `statistics`. `prefix` precedes the names of variables in
-    /// errors.
+    /// Performs a step as [`Self::update`] does, and also applies the changes in `statistics`. `prefix` precedes the
+    /// names of variables in errors.
     pub(crate) fn update_with(
         &mut self,
         settings: &AdamSettings,
@@ -102,11 +103,11 @@ impl Adam {
         Ok(loss)
     }
 
-    /// Checks that all numbers of some tensors are finite. Returns the number of a scalar, copied together with the
-    /// checks.
+    /// Checks that all values of the given tensors are finite. Returns the value of `scalar`, which is copied from the
+    /// device together with the results of the checks.
     ///
     /// # Errors
-    /// Names the first tensor with a number that is not finite.
+    /// [`NetworkError`] that names the first tensor with a value that is not finite.
     pub(crate) fn checked(
         &self,
         tensors: &[(String, &Tensor)],
@@ -184,7 +185,7 @@ impl Adam {
         self.steps
     }
 
-    /// Sets the number of steps that belongs to loaded moments.
+    /// Sets the number of steps after which the loaded moments were saved.
     pub(crate) fn set_steps(&mut self, steps: u64) {
         self.steps = steps;
     }
@@ -194,7 +195,7 @@ fn names(variable: &str) -> [String; 2] {
     ["first", "second"].map(|which| format!("{which}.{variable}"))
 }
 
-/// Updates an exponential moving average with new numbers.
+/// Updates an exponential moving average with new values.
 fn towards(old: &Var, new: &Tensor, beta: f64) -> Result<Tensor> {
     let mean = ((old.as_detached_tensor() * beta)? + (new * (1.0 - beta))?)?;
     (mean + FLUSH)? - FLUSH
@@ -221,7 +222,7 @@ mod tests {
     /// Compares with the formulas of Kingma and Ba in 64 bits: `torch.optim.Adam([p], lr=.1, betas=(.5, .9))` on
     /// `p = 1, -2` with gradients `(.5, -3)` and `(.25, 4)`.
     #[test]
-    fn two_steps_are_those_of_the_published_formulas() {
+    fn two_steps_agree_with_the_published_formulas() {
         let settings = AdamSettings::paper(0.1);
         let mut adam = Adam::new(variables()).expect("moments");
         let mut exact = [1.0_f64, -2.0];
@@ -242,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn large_gradients_are_scaled_to_the_norm_and_small_ones_are_not() {
+    fn only_large_gradients_are_scaled_to_the_maximum_norm() {
         for (g, expected) in [([3.0, 4.0], [0.3, 0.4]), ([0.3, 0.4], [0.15, 0.2])] {
             let settings = AdamSettings {
                 max_norm: Some(1.0),

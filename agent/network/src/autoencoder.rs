@@ -96,7 +96,7 @@ impl Autoencoder {
         &self.settings
     }
 
-    /// Returns the sizes: grid, states, observations and vectors.
+    /// Returns the sizes of the network: the grid, the numbers of states and observations, and the lengths of vectors.
     pub fn shape(&self) -> &NetworkShape {
         &self.shape
     }
@@ -121,7 +121,7 @@ impl Autoencoder {
         self.settings.adam.learning_rate = learning_rate;
     }
 
-    /// Returns the learned observation matrix `O`, row-major `[observation][state]`. Columns sum to one.
+    /// Returns the learned observation matrix `O`, row-major `[observation][state]`. Each column sums to one.
     pub fn observation_matrix(&self) -> Result<Vec<f32>, NetworkError> {
         Ok(numbers_of(&self.network.observation_matrix()?)?)
     }
@@ -139,7 +139,7 @@ impl Autoencoder {
     /// Computes the next hidden vector from a hidden vector and a window with a single frame.
     ///
     /// # Errors
-    /// [`NetworkError`] if a number is not finite, or the device fails.
+    /// [`NetworkError`] if a value is not finite, or the device fails.
     ///
     /// # Panics
     /// If the frame does not fit the network.
@@ -174,7 +174,7 @@ impl Autoencoder {
     /// loss before the step.
     ///
     /// # Errors
-    /// [`NetworkError`] if a number is not finite, or the device fails. An error changes nothing.
+    /// [`NetworkError`] if a value is not finite, or the device fails. The network is then unchanged.
     ///
     /// # Panics
     /// If the window has no cells to predict or does not fit the network.
@@ -183,7 +183,7 @@ impl Autoencoder {
         self.update_with(window, &dropout, &self.draw_hidden(self.n_updates))
     }
 
-    /// Like [`Self::update`], with given masks and `h_0`.
+    /// Performs a step as [`Self::update`] does, but with the given dropout masks and `h_0`.
     pub fn update_with(
         &mut self,
         window: &Window,
@@ -220,11 +220,11 @@ impl Autoencoder {
         [self.adam.steps(), self.n_updates]
     }
 
-    /// Loads the results of [`Self::named_tensors`] and [`Self::counters`] of a network with the same sizes. `find`
-    /// returns the numbers for a name and a shape.
+    /// Loads the state that [`Self::named_tensors`] and [`Self::counters`] returned for a network with the same sizes.
+    /// `find` returns the values of a tensor with a given name and shape.
     ///
     /// # Errors
-    /// If `find` or the device fails. An error changes nothing.
+    /// If `find` or the device fails. The network is then unchanged.
     pub fn load<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -240,7 +240,7 @@ impl Autoencoder {
     /// Loads only the parameters and statistics, for example from a network trained with PyTorch.
     ///
     /// # Errors
-    /// If `find` or the device fails. An error changes nothing.
+    /// If `find` or the device fails. The network is then unchanged.
     pub fn load_variables<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,

@@ -37,7 +37,8 @@ impl BatchNorm {
         [&self.gamma, &self.beta]
     }
 
-    /// Returns the moments to normalise with. In training, these are the moments of the window, which it also stores.
+    /// Returns the moments to normalise with. In training, these are the moments of the window, which are also stored
+    /// in the pass.
     pub(crate) fn moments(&self, pass: &Pass<'_>, of_window: Moments) -> Result<Moments> {
         if !pass.trains() {
             return Ok(Moments {

@@ -3,7 +3,8 @@
 use crate::unet::ALIGNMENT;
 use emberwatch_model::grid::Shape;
 
-/// Margin of a crop around the cells to predict, on both sides together, in cells. Cells further away hardly matter.
+/// Sum of the margins on both sides of the cells to predict, in cells. Cells farther away hardly affect the
+/// predictions.
 const MARGINS: usize = 24;
 
 /// A rectangular part of a grid, with sides that are multiples of [`ALIGNMENT`]. It may extend beyond the grid's lower
@@ -29,7 +30,7 @@ impl Crop {
         }
     }
 
-    /// Returns sides that fit each of the given extents with margins.
+    /// Returns the sides of a crop that is large enough for each of the given extents with margins.
     pub(crate) fn sides(shape: Shape, extents: &[Extent]) -> [usize; 2] {
         let whole = Self::whole(shape);
         [0, 1].map(|axis| {
@@ -39,7 +40,8 @@ impl Crop {
         })
     }
 
-    /// Returns the crop with the given sides and an extent at its centre, moved to lie inside the aligned grid.
+    /// Returns the crop with the given sides that has an extent at its centre. A crop that would leave the aligned grid
+    /// is moved inside.
     pub(crate) fn around(shape: Shape, sides: [usize; 2], extent: &Extent) -> Self {
         let whole = Self::whole(shape);
         let first = [0, 1].map(|axis| {
@@ -73,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn crops_hold_their_cells_with_margins_up_to_the_edges() {
+    fn crops_contain_their_cells_with_margins() {
         let shape = Shape::new(70, 30).expect("test shape");
         let extents = [extent(shape, [33, 95].into_iter()), [[50, 69], [0, 9]]];
         assert_eq!(extents[0], [[1, 3], [3, 5]]);

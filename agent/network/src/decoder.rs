@@ -1,5 +1,5 @@
-//! `Decoder(h)` of paper eq. 9. It doubles a seed of a few cells four times, with Dropout2d, normalisation and ReLU
-//! between.
+//! `Decoder(h)` of paper eq. 9. It doubles the sides of a seed of a few cells four times, with Dropout2d, normalisation
+//! and ReLU in between.
 
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
@@ -27,7 +27,8 @@ const KERNEL: usize = 4;
 /// The decoder, from hidden vectors to logits of states.
 #[derive(Debug)]
 pub struct Decoder {
-    /// The weights `[hidden, channels, rows, cols]` of a transposed convolution, which on a single cell is a matrix.
+    /// The weights `[hidden, channels, rows, cols]` of a transposed convolution, which is a matrix product if applied
+    /// to a single cell.
     seed: Tensor,
     levels: Vec<Level>,
     operators: Operators,
@@ -106,8 +107,8 @@ impl Decoder {
         }
     }
 
-    /// Computes the loss and its gradients together, because the loss is a single number. No tensor of logits is
-    /// needed.
+    /// Computes the loss and its gradients together. This is possible because the loss is a scalar, and it avoids a
+    /// tensor of logits.
     fn own_loss(&self, z: &Tensor, observation: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let all = Mask::all(pass.window.len(), self.n_states()?);
         let layers = self.layers(pass, &all)?;
@@ -168,7 +169,7 @@ impl Decoder {
             .collect()
     }
 
-    /// Computes the first maps, `[frames, channels, rows, cols]`.
+    /// Computes the first feature maps, `[frames, channels, rows, cols]`.
     fn seed(&self, hidden: &Tensor) -> Result<Tensor> {
         let (n_hidden, channels, rows, cols) = self.seed.dims4()?;
         let seed = hidden.matmul(&self.seed.reshape((n_hidden, ()))?)?;
@@ -186,7 +187,7 @@ impl Decoder {
     }
 }
 
-/// Returns the channels, rows and columns of the last result.
+/// Returns the number of channels, rows and columns of the last layer's output.
 fn last_map(layers: &[Layer<'_>]) -> [usize; 3] {
     let last = layers.last().expect("invariant: four levels");
     last.conv.sizes.large

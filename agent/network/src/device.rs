@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_device_that_was_not_built_in_is_refused_by_name() {
+    fn an_unsupported_device_is_rejected_by_name() {
         for (name, is_built) in [
             ("cpu", true),
             ("cuda", cfg!(feature = "cuda")),

@@ -1,7 +1,7 @@
 //! Dropout2d: in training, each channel of each frame is dropped with probability one half.
 //!
-//! Kept channels are scaled by two, which preserves the mean. A mask holds factors for candle's operators, and a list
-//! of kept channels for our operators, which skip dropped channels.
+//! Kept channels are scaled by two, which preserves the mean. A mask contains factors for candle's operators, and a
+//! list of kept channels for our operators, which skip dropped channels.
 
 use crate::shape::{DECODER_CHANNELS, ENCODER_CHANNELS};
 use candle_core::{DType, Device, Result, Tensor};
@@ -17,12 +17,13 @@ pub struct Mask {
     /// The factor of each frame and channel: `scale`, or 0 for a dropped channel.
     scales: Arc<[f32]>,
     kept: Arc<[usize]>,
-    /// The start of each frame's kept channels, and the end of the last frame's.
+    /// The index in `kept` at which each frame's channels start, and the end of the last frame's channels.
     starts: Arc<[usize]>,
 }
 
 impl Mask {
-    /// Creates a mask that keeps the channels with `keeps(frame, channel)`, and multiplies them by `scale`.
+    /// Creates a mask that keeps the channels for which `keeps(frame, channel)` is true, and multiplies them by
+    /// `scale`.
     pub fn new(
         n_frames: usize,
         channels: usize,
@@ -88,9 +89,9 @@ impl Mask {
 /// The masks of one window for all seven layers with dropout.
 #[derive(Debug, Clone)]
 pub struct Dropout {
-    /// After the encoder's convolutions.
+    /// The masks after the encoder's convolutions.
     pub encoder: [Mask; ENCODER_CHANNELS.len()],
-    /// After all transposed convolutions of the decoder but the last.
+    /// The masks after the decoder's transposed convolutions, except the last.
     pub decoder: [Mask; DECODER_CHANNELS.len()],
 }
 
@@ -103,7 +104,7 @@ impl Dropout {
         }
     }
 
-    /// Draws the masks of an update, with a fair coin for each frame and channel.
+    /// Draws the masks of an update by tossing a fair coin for each frame and channel.
     pub fn draw(n_frames: usize, seed: u64, update: u64) -> Self {
         let mut rng = stream(seed, Purpose::Dropout, update);
         let mut toss = |channels: usize| {

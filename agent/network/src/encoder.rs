@@ -76,7 +76,8 @@ impl Encoder {
         x.flatten_from(1)
     }
 
-    /// Computes the encodings with our operators. The linear layer is a convolution whose kernel covers the whole map.
+    /// Computes the encodings with our operators. The linear layer is computed as a convolution whose kernel covers the
+    /// whole map.
     fn ours(&self, pass: &Pass<'_>) -> Result<Tensor> {
         let (n_frames, encoding) = (pass.window.len(), self.linear.weight().dim(0)?);
         let all = Mask::all(n_frames, encoding);

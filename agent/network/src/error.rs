@@ -12,7 +12,7 @@ pub struct NotFinite {
     pub tensor: String,
 }
 
-/// The reason why a step or an update failed. A failure changes nothing.
+/// The reason why a step or an update failed. A failed step or update changes nothing.
 #[derive(Debug, Clone, Error, PartialEq)]
 pub enum NetworkError {
     /// A number is not finite.

@@ -36,10 +36,10 @@ impl Gru {
     }
 
     /// Computes the hidden vector after each input, `[steps, hidden]`, from inputs `[steps, inputs]`. `first` is the
-    /// hidden vector before them.
+    /// hidden vector before the first input.
     ///
     /// # Panics
-    /// If `first` has another length.
+    /// If `first` has the wrong length.
     pub fn forward(&self, x: &Tensor, first: &[f32]) -> Result<Tensor> {
         assert_eq!(
             first.len(),

@@ -1,5 +1,6 @@
 //! The paper's networks as candle models: the dynamic autoencoder (sections III.B and III.C, eqs. 7 to 11) and the DQN
-//! (section III.E). The crate also has a neural belief, which minimises the autoencoder's loss and preserves the grid.
+//! (section III.E). The crate also has a neural belief, which minimises the same loss but works on the grid itself
+//! instead of on a hidden vector.
 //!
 //! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`] (its
 //! updates and steps), [`Adam`], [`Dqn`]; [`Sightings`], [`UNet`], [`NeuralBelief`].

@@ -59,7 +59,7 @@ impl Network {
 }
 
 impl NetworkShape {
-    /// Counts the numbers in the network's parameters and statistics without allocating them.
+    /// Counts the values in the network's parameters and statistics without allocating them.
     pub fn n_numbers(&self) -> usize {
         count_numbers(|vb| Network::new(&vb, self, Operators::Own))
     }
@@ -71,7 +71,7 @@ mod tests {
     use emberwatch_model::Shape;
 
     #[test]
-    fn numbers_are_counted_before_they_are_made() {
+    fn all_parameters_and_statistics_are_counted() {
         // Convolutions 6,176 + 8,208 + 1,160, linear 516, GRU 120, decoder 8,192 + 131,072 + 32,768 + 8,192 + 768,
         // observation matrix 9, and four numbers for each of the 296 channels of the seven normalisations.
         assert_eq!(shape(64).n_numbers(), 197_181 + 4 * 296);

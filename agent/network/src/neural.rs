@@ -1,5 +1,5 @@
 //! The neural belief: a network on the grid that predicts the distribution of each cell's next observation from past
-//! observations. It learns from masked frames alone.
+//! observations. It learns only from masked frames.
 //!
 //! The idea and the loss come from the dynamic autoencoder (paper section III.B, eqs. 8 and 11). Instead of one hidden
 //! vector for the whole grid, each cell stores its last observations and their ages.
@@ -58,7 +58,7 @@ pub struct Lesson {
     pub before: Sightings,
     /// The row-major index and the value of each observed cell, at least one.
     pub frame: Vec<(usize, u8)>,
-    /// The prediction for these cells by the filter that the network corrects, `[cells, O]`. Empty if there is no
+    /// The prediction for these cells, `[cells, O]`, by the filter that the network corrects. Empty if there is no such
     /// filter.
     pub base: Vec<f32>,
 }
@@ -70,7 +70,7 @@ impl NeuralBelief {
         Self::with_operators(n_observations, seed, device, operators)
     }
 
-    /// Creates a network like [`Self::new`], with the given operators. Candle's operators work on every device.
+    /// Creates a network as [`Self::new`] does, but with the given operators. Candle's operators work on every device.
     pub fn with_operators(
         n_observations: usize,
         seed: u64,
@@ -90,12 +90,12 @@ impl NeuralBelief {
         })
     }
 
-    /// Returns an identifier shared by clones only.
+    /// Returns an identifier that only clones share.
     pub fn id(&self) -> usize {
         Arc::as_ptr(&self.unet).addr()
     }
 
-    /// Returns the number of values that a cell may show.
+    /// Returns the number of values that a cell can show.
     pub fn n_observations(&self) -> usize {
         self.n_observations
     }
@@ -115,10 +115,11 @@ impl NeuralBelief {
         Ok(named_numbers(&[("", self.variables())])?)
     }
 
-    /// Loads the result of [`Self::parameters`]. `find` returns the numbers for a name and a shape.
+    /// Loads parameters that [`Self::parameters`] returned. `find` returns the values of a tensor with a given name and
+    /// shape.
     ///
     /// # Errors
-    /// If `find` or the device fails. An error changes nothing.
+    /// If `find` or the device fails. The network is then unchanged.
     pub fn set_parameters<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -128,10 +129,10 @@ impl NeuralBelief {
     }
 
     /// Predicts the distribution of each cell's observation in the current step, `[O, H, W]`. `base` is the prediction
-    /// of the filter that the network corrects.
+    /// of the filter that the network corrects, if there is one.
     ///
     /// # Errors
-    /// If a number is not finite, or the device fails.
+    /// If a value is not finite, or the device fails.
     pub fn predict(
         &self,
         sightings: &Sightings,
@@ -141,11 +142,11 @@ impl NeuralBelief {
         Ok(all.swap_remove(0))
     }
 
-    /// Predicts several worlds with the same grid, like [`Self::predict`]. Either all worlds have a base, or none has.
-    /// Our operators predict one world per thread, and candle's operators many worlds in one pass.
+    /// Predicts several worlds with the same grid, each as [`Self::predict`] does. Either all worlds have a base or
+    /// none does. Our operators predict one world per thread, and candle's operators many worlds in one pass.
     ///
     /// # Errors
-    /// Like [`Self::predict`].
+    /// The same as for [`Self::predict`].
     pub fn predict_all(&self, worlds: &[Seen<'_>]) -> Result<Vec<Probabilities>, NetworkError> {
         let Some((first, _)) = worlds.first() else {
             return Ok(Vec::new());
@@ -200,8 +201,8 @@ impl NeuralBelief {
         Ok(worlds.map(world).collect())
     }
 
-    /// Computes the mean cross-entropy of the cells of some lessons with the same grid (paper eqs. 8 and 11). The
-    /// network reads crops around these cells. Lessons beyond the size of a batch are ignored.
+    /// Computes the mean cross-entropy over the observed cells of lessons, which must have the same grid (paper eqs. 8
+    /// and 11). The network reads crops around these cells. Lessons beyond the size of a batch are ignored.
     ///
     /// # Panics
     /// If there is no lesson, if a lesson has no cells, or if only some lessons have a base.
@@ -292,10 +293,10 @@ impl NeuralBelief {
         (log_softmax(&logits, 1)? * weights)?.sum_all()
     }
 
-    /// Performs one step of Adam on lessons, and returns the loss before it.
+    /// Performs one step of Adam on lessons, and returns the loss before the step.
     ///
     /// # Errors
-    /// If a number is not finite, or the device fails. An error changes nothing.
+    /// If a value is not finite, or the device fails. The network is then unchanged.
     pub fn update(&mut self, learning_rate: f32, lessons: &[Lesson]) -> Result<f64, NetworkError> {
         let loss = self.loss(lessons)?;
         let settings = AdamSettings {
@@ -315,11 +316,11 @@ impl NeuralBelief {
         [("", self.variables()), ("adam.", self.adam.moments())]
     }
 
-    /// Loads the result of [`Self::named_tensors`] after `n_updates` updates. `find` returns the numbers for a name and
-    /// a shape.
+    /// Loads tensors that [`Self::named_tensors`] returned after `n_updates` updates. `find` returns the values of a
+    /// tensor with a given name and shape.
     ///
     /// # Errors
-    /// If `find` or the device fails. An error changes nothing.
+    /// If `find` or the device fails. The network is then unchanged.
     pub fn load<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -331,7 +332,7 @@ impl NeuralBelief {
         Ok(())
     }
 
-    /// Returns the logarithms of probabilities, each at least [`LEAST`].
+    /// Returns the logarithms of probabilities, after raising each probability to at least [`LEAST`].
     fn logarithms<'a>(
         &self,
         probabilities: impl Iterator<Item = &'a f32>,

@@ -28,21 +28,22 @@ impl ObservationMatrix {
     }
 
     /// Computes the mean cross-entropy of the cells to predict in a window, from logits `[frames, states, rows, cols]`,
-    /// with candle's operators. It is a weighted sum over all cells, so that nothing is gathered or scattered.
+    /// with candle's operators. The loss is computed as a weighted sum over all cells, without gather or scatter
+    /// operations.
     pub fn loss(&self, logits: &Tensor, window: &Window) -> Result<Tensor> {
         let matrix = self.matrix()?;
         let u = softmax(logits, 1)?.permute((0, 2, 3, 1))?;
         let q = u.reshape(((), matrix.dim(1)?))?.matmul(&matrix.t()?)?;
         let [hits, misses] = weights(logits, window, &q)?;
         let hit = (hits * (&q + LOG_FLOOR)?.log()?)?;
-        // Rounding may make q larger than 1.
+        // Rounding can make q larger than 1.
         let miss = (misses * ((1.0 - &q)?.relu()? + LOG_FLOOR)?.log()?)?;
         (hit + miss)?.sum_all()
     }
 }
 
 /// Returns the weights of the terms `log q` and `log(1 - q)` in the loss, each `[cells, observations]` like `q`. The
-/// first are nonzero for the observed values, the second for the other values of observed cells.
+/// first weights are nonzero for the observed values, the second weights for the other values of observed cells.
 fn weights(logits: &Tensor, window: &Window, q: &Tensor) -> Result<[Tensor; 2]> {
     let (_, _, rows, cols) = logits.dims4()?;
     let (n, weight) = (q.dim(1)?, -1.0 / window.all_targets().len() as f32);

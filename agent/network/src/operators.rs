@@ -2,7 +2,7 @@
 
 use candle_core::{DType, Device};
 
-/// The implementation of the networks' operators. Both compute the same results, up to rounding.
+/// The implementation of the networks' operators. Both implementations compute the same results, up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Operators {
     /// Hand-written kernels and gradients (`ops`), for 32-bit floats on the CPU.

@@ -1,12 +1,13 @@
 //! Operators with hand-written kernels and gradients, for 32-bit floats on the CPU.
 //!
-//! Each layer also has an implementation with candle's operators, which runs on other devices and number types. Tests compare
-//! the two.
+//! Each layer also has an implementation with candle's operators, which runs on other devices and number types. Tests
+//! compare the two implementations.
 //!
 //! - [`conv`]: the arithmetic of plain and transposed convolutions, one frame at a time, on the matrix [`product`]s.
-//! - [`image_conv`], [`doubled_sum`]: the U-Net's operators, a convolution with bias, ReLU and residual, and upsampling.
-//! - [`chain`]: the autoencoder's encoder and decoder, sequences of convolutions ([`stage`]) with dropout, normalisation
-//!   ([`norm`]) and ReLU ([`activation`]) between them. [`cell_loss`]: their loss at visited cells.
+//! - [`image_conv`], [`doubled_sum`]: the U-Net's operators: a convolution with bias, ReLU and residual, and
+//!   upsampling.
+//! - [`chain`]: the autoencoder's encoder and decoder, sequences of convolutions ([`stage`]) with dropout,
+//!   normalisation ([`norm`]) and ReLU ([`activation`]) between them. [`cell_loss`]: the loss at visited cells.
 //! - [`gru_sequence`]: a GRU over a sequence.
 
 pub(crate) mod activation;

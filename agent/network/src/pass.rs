@@ -30,10 +30,10 @@ pub(crate) struct KeptMoments {
 }
 
 impl<'a> Pass<'a> {
-    /// Creates the pass of an update.
+    /// Creates the pass for an update.
     ///
     /// # Panics
-    /// If the window is empty, or a mask has another number of frames.
+    /// If the window is empty, or a mask has a different number of frames.
     pub fn training(window: &'a Window, dropout: &Dropout) -> Self {
         let masks = dropout.encoder.iter().chain(&dropout.decoder);
         let fits = masks
@@ -51,7 +51,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// Creates the pass of an estimator, with running statistics and without dropout.
+    /// Creates the pass for an estimator, with running statistics and without dropout.
     pub fn inference(window: &'a Window) -> Self {
         Self {
             window,

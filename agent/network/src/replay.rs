@@ -14,7 +14,7 @@ pub struct FrameReplay {
     frames: VecDeque<Frame>,
     /// Number of frames that were ever added.
     n_pushed: u64,
-    /// The number of the first frame of each track but the oldest.
+    /// For each track except the oldest, the number of its first frame, counted from the first frame ever added.
     begins: VecDeque<u64>,
 }
 
@@ -47,12 +47,12 @@ impl FrameReplay {
         }
     }
 
-    /// Returns the number of the oldest frame in the buffer.
+    /// Returns the number of the oldest frame in the buffer, counted from the first frame ever added.
     fn n_oldest(&self) -> u64 {
         self.n_pushed - self.frames.len() as u64
     }
 
-    /// Returns the possible starts of windows with some length, as ranges of indices.
+    /// Returns the possible starts of windows of the given length, as ranges of indices.
     fn starts(&self, length: usize) -> Vec<Range<usize>> {
         let oldest = self.n_oldest();
         let begins = self.begins.iter().map(|begin| (begin - oldest) as usize);
@@ -67,7 +67,7 @@ impl FrameReplay {
         self.frames.iter()
     }
 
-    /// Returns the index of the first frame of each track but the oldest.
+    /// Returns the index of the first frame of each track except the oldest.
     pub fn tracks(&self) -> impl Iterator<Item = u64> {
         let oldest = self.n_oldest();
         self.begins.iter().map(move |begin| begin - oldest)
@@ -132,7 +132,7 @@ mod tests {
             }
             replay.push(frame.clone());
         }
-        // Indices 0 to 9 hold frames 20 to 29.
+        // Indices 0 to 9 contain frames 20 to 29.
         assert_eq!(replay.starts(1), [0..1, 1..5, 5..6, 6..10]);
         assert_eq!(replay.starts(4), [1..2, 6..7]);
         assert!(replay.window(5, 0, 0).is_none());

@@ -1,6 +1,7 @@
 //! The sizes of all layers, computed from the grid and the numbers of states and observations.
 //!
-//! The authors' network is for 64 x 64 cells. Ours fits any grid by two rules, which do not change that network:
+//! The authors' network is for 64 x 64 cells. Ours fits any grid, thanks to two rules that leave the network for 64 x
+//! 64 cells unchanged:
 //!
 //! - The decoder doubles a seed of `ceil(H / 16) x ceil(W / 16)` cells four times (4 x 4 cells for 64 x 64). The result
 //!   beyond the grid's lower and right edges is cut off.
@@ -12,7 +13,7 @@ use emberwatch_model::grid::Shape;
 /// Number of channels after each convolution of the encoder.
 pub const ENCODER_CHANNELS: [usize; 3] = [32, 16, 8];
 
-/// Number of channels after each transposed convolution of the decoder but the last.
+/// Number of channels after each transposed convolution of the decoder except the last.
 pub const DECODER_CHANNELS: [usize; 4] = [128, 64, 32, 16];
 
 /// Kernel side and stride of the encoder's convolutions.
@@ -21,7 +22,7 @@ const ENCODER_KERNELS: [(usize, usize); 3] = [(8, 4), (4, 2), (3, 1)];
 /// Side of a seed cell in cells of the padded grid, after four doublings.
 const SEED_CELL: usize = 16;
 
-/// The sizes from which all tensor shapes follow.
+/// The sizes that determine all tensor shapes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NetworkShape {
     /// The grid, H x W.
@@ -106,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn the_paper_s_grid_gives_the_authors_sizes() {
+    fn the_grid_of_the_paper_has_the_authors_sizes() {
         let shape = shape(64, 64);
         assert_eq!(shape.seed(), [4, 4]);
         let outputs = shape.convolutions().map(|conv| conv.output);
@@ -115,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn other_grids_are_padded_and_their_kernels_cut() {
+    fn other_grids_are_padded_and_their_kernels_reduced() {
         let sizes = |height, width| {
             let shape = shape(height, width);
             let [.., last] = shape.convolutions();

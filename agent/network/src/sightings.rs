@@ -8,10 +8,11 @@ use serde::{Deserialize, Serialize};
 /// Number of bytes of a [`Sighting`] in [`Sightings::to_bytes`].
 const SIGHTING_BYTES: usize = 5;
 
-/// Maximum age of a sighting in steps. Older sightings have the same features.
+/// Maximum age in the features of a sighting, in steps. Older sightings have the same features.
 const OLDEST: usize = 4000;
 
-/// Numbers of steps in which the freshness of a sighting decays to `1/e`. Some worlds change quickly, others slowly.
+/// Numbers of steps in which the freshness of a sighting decays to `1/e`. There are several, because some worlds change
+/// quickly and others slowly.
 const FADING_STEPS: [f32; 3] = [10.0, 60.0, 400.0];
 
 /// The value that a cell showed, and the step in which it was seen.
@@ -19,7 +20,7 @@ const FADING_STEPS: [f32; 3] = [10.0, 60.0, 400.0];
 pub struct Sighting {
     /// The observed value, or [`UNOBSERVED`] if the cell was not seen.
     pub value: u8,
-    /// The step by the counter of [`Sightings`].
+    /// The step in which the cell was seen, as counted by [`Sightings`].
     pub step: u32,
 }
 
@@ -32,7 +33,8 @@ pub struct Sightings {
     cells: Vec<[Sighting; 2]>,
 }
 
-/// The features of cells, with a table of the numbers that depend on ages from 0 to [`OLDEST`].
+/// The computation of cells' features. A table contains the features that depend on an age, for ages from 0 to
+/// [`OLDEST`].
 #[derive(Debug, Clone)]
 pub struct Features {
     n_observations: usize,
@@ -88,7 +90,8 @@ impl Sightings {
         self.step = self.step.saturating_add(1);
     }
 
-    /// Returns the value that a cell showed last, and its age in steps, or `None` if the cell was never seen.
+    /// Returns the value that a cell showed last and the number of steps since then, or `None` if the cell was never
+    /// seen.
     pub fn last(&self, cell: usize) -> Option<(u8, u32)> {
         let [last, _] = self.cells[cell];
         (last.value != UNOBSERVED).then(|| (last.value, self.step - last.step))
@@ -155,12 +158,12 @@ impl Features {
         }
     }
 
-    /// Returns the number of features of a cell, which are in this order:
+    /// Returns the number of features of a cell. The features are, in this order:
     ///
     /// - one-hot codes of the last observation, weighted by its freshness on three time scales (3 per observation)
-    /// - a one-hot code of the observation before, weighted by its freshness (1 per observation)
+    /// - a one-hot code of the second-latest observation, weighted by its freshness (1 per observation)
     /// - whether the cell was never seen, the logarithm of its age, whether it is inside the grid, and the freshness of
-    ///   the observation before on the longest time scale
+    ///   the second-latest observation on the longest time scale
     pub fn n_channels(n_observations: usize) -> usize {
         4 * n_observations + 4
     }
@@ -212,7 +215,8 @@ mod tests {
         Shape::new(1, 3).expect("test shape")
     }
 
-    /// Cell 0 shows 1, and after five steps 0. Cell 1 shows 2 after five steps. Cell 2 is never seen.
+    /// Creates sightings in which cell 0 shows 1 at first and 0 five steps later. Cell 1 shows 2 after five steps, and
+    /// cell 2 is never seen.
     fn sightings() -> Sightings {
         let mut sightings = Sightings::new(shape());
         let frame = |values| Frame::from_bytes(shape(), 3, values).expect("test frame");
@@ -224,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn features_tell_what_was_seen_when_and_what_lies_inside() {
+    fn features_encode_values_ages_and_cells_off_the_grid() {
         let crop = Crop::whole(shape());
         assert_eq!((crop.sides, Features::n_channels(3)), ([4, 4], 16));
         let mut features = vec![0.0; 16 * 16];
@@ -251,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn sightings_go_through_bytes_and_others_are_refused() {
+    fn sightings_are_restored_and_invalid_bytes_rejected() {
         let sightings = sightings();
         let bytes = sightings.to_bytes();
         let read = |bytes: &[u8]| Sightings::from_bytes(bytes, shape(), 3);

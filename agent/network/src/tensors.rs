@@ -13,7 +13,7 @@ pub(crate) type Change = (String, Var, Tensor);
 /// Groups of variables, each with the prefix of its names in a checkpoint.
 pub(crate) type Groups<'a> = &'a [(&'static str, &'a Variables)];
 
-/// Returns the numbers of a tensor, row-major.
+/// Returns the values of a tensor, row-major.
 pub(crate) fn numbers_of(tensor: &Tensor) -> Result<Vec<f32>> {
     tensor.to_dtype(DType::F32)?.flatten_all()?.to_vec1()
 }
@@ -33,7 +33,8 @@ pub(crate) fn named_numbers(groups: Groups<'_>) -> Result<Vec<NamedTensor>> {
         .collect()
 }
 
-/// Returns the changes that set all variables to new numbers. `find` returns the numbers for a name and a shape.
+/// Returns the changes that set all variables to new values. `find` returns the values of a tensor with a given name
+/// and shape.
 pub(crate) fn found<E: From<NetworkError>>(
     groups: Groups<'_>,
     find: impl Fn(&str, &[usize]) -> std::result::Result<Vec<f32>, E>,
@@ -53,7 +54,7 @@ pub(crate) fn set(changes: &[Change]) -> Result<()> {
         .try_for_each(|(_, var, tensor)| var.set(tensor))
 }
 
-/// Returns a scalar that is 0 if all numbers of a tensor are finite, and NaN otherwise: it sums the products with 0.
+/// Returns a scalar that is 0 if all values of a tensor are finite, and NaN otherwise: the sum of all values times 0.
 pub(crate) fn zero_if_finite(tensor: &Tensor) -> Result<Tensor> {
     (tensor * 0.0)?.sum_all()
 }

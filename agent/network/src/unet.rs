@@ -11,13 +11,13 @@ use crate::variables::uniform_init;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
-/// The sides of images are multiples of this number, because of two strides of 2.
+/// The sides of images are multiples of this number, because two convolutions have a stride of 2.
 pub const ALIGNMENT: usize = 4;
 
 /// Number of channels at full, half and quarter size.
 const CHANNELS: [usize; 3] = [16, 24, 32];
 
-/// Number of cells in a 3 x 3 patch, in the order of a kernel's taps.
+/// Number of cells in a 3 x 3 patch. The cells are in the order of a kernel's taps.
 const AROUND: usize = 9;
 
 /// The network, from features of cells to logits of observations.
@@ -88,8 +88,8 @@ impl UNet {
         self.head.forward(&last.residual(&full)?)
     }
 
-    /// Computes the logits of the given cells, `[cells, observations]`. The last layers skip all other cells. A cell is
-    /// given by its image, row and column.
+    /// Computes the logits of the given cells, `[cells, observations]`. The last layers skip all other cells. Each cell
+    /// is specified by its image, row and column.
     pub fn logits_at(&self, x: &Tensor, cells: &[[usize; 3]]) -> Result<Tensor> {
         let [full, half] = self.features(x)?;
         let [point, last] = &self.up[1];
@@ -196,8 +196,8 @@ impl Layer {
     }
 }
 
-/// The indices of the cells in 3 x 3 patches around some cells, among the cells of all images, at full and at half
-/// size. `is_inside` is 1 for cells inside the image and 0 for others.
+/// The cells of 3 x 3 patches, as indices into the cells of all images at full size and at half size. `is_inside` is 1
+/// for cells inside the image and 0 for others.
 struct Around {
     full: Vec<u32>,
     half: Vec<u32>,

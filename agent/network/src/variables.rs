@@ -17,8 +17,8 @@ pub type Variables = BTreeMap<String, Var>;
 
 /// Builds a model whose layers request their variables from a [`VarBuilder`]. Returns the model and its variables.
 ///
-/// A variable's initial value depends only on the seed and its own name. So an added layer does not change the initial
-/// values of other layers.
+/// A variable's initial value depends only on the seed and on the variable's name. Adding a layer therefore does not
+/// change the initial values of other layers.
 pub fn build<M>(
     seed: u64,
     dtype: DType,
@@ -51,7 +51,7 @@ pub(crate) fn uniform_init(fan_in: usize) -> Init {
     Init::Uniform { lo: -up, up }
 }
 
-/// Counts the numbers in a model's variables without allocating them.
+/// Counts the values in a model's variables without allocating them.
 pub(crate) fn count_numbers<M>(model: impl FnOnce(VarBuilder<'static>) -> Result<M>) -> usize {
     let count = Arc::new(AtomicUsize::new(0));
     let backend = Box::new(Counting(count.clone()));
@@ -121,7 +121,7 @@ impl SimpleBackend for Seeded {
             let mut variables = variables.expect("invariant: no layer panicked");
             variables.insert(name.to_owned(), Var::from_tensor(&first)?);
         }
-        // A variable that exists already is shared, if its shape is the same.
+        // An existing variable is shared if its shape is the same.
         self.variables.get(shape, name, init, dtype, device)
     }
 
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn first_values_depend_on_seed_and_name_alone() {
+    fn initial_values_depend_only_on_seed_and_name() {
         let init = uniform_init(16);
         assert_eq!(numbers(1, "a", init), numbers(1, "a", init));
         assert_ne!(numbers(1, "a", init), numbers(2, "a", init));
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn first_values_have_the_distribution_asked_for() {
+    fn initial_values_have_the_requested_distribution() {
         let largest = |numbers: Vec<f32>| numbers.iter().fold(0.0_f32, |max, x| max.max(x.abs()));
         let root_of_mean_square = |numbers: Vec<f32>| {
             let squares: f32 = numbers.iter().map(|x| x * x).sum();

@@ -17,7 +17,7 @@ pub(crate) struct Visit {
 #[derive(Debug, Clone)]
 pub struct Window {
     visits: Arc<[Visit]>,
-    /// The start of each frame's visits, and the end of the last frame's.
+    /// The index at which each frame's visits start, and the end of the last frame's visits.
     starts: Arc<[usize]>,
 }
 
@@ -71,7 +71,7 @@ impl Window {
         }
     }
 
-    /// Returns the cells to predict after all frames, which are the terms of the loss.
+    /// Returns the cells to predict after all frames. Each is one term of the loss.
     pub(crate) fn all_targets(&self) -> &[Visit] {
         &self.visits[self.starts[1.min(self.len())]..]
     }

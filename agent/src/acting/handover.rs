@@ -1,5 +1,5 @@
-//! How an agent continues from a former agent's belief: with the belief that it left with the server, or otherwise with
-//! the frames that the server keeps.
+//! How an agent takes over from a former agent: from the belief that the former agent left with the server, or
+//! otherwise from the frames that the server keeps.
 
 use crate::client::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
@@ -9,11 +9,11 @@ use emberwatch_protocol::Client;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::message::Status;
 
-/// Number of frames to recall before the lease is renewed. Recalling them takes much less than the shortest lease.
+/// Number of frames to recall before the lease is renewed. Recalling them takes much less time than any lease lasts.
 const RENEW_AFTER: u64 = 500;
 
 /// Restores an agent's belief from what the server keeps. Returns true if the belief already includes the present
-/// frame, and is about X_{k+1}. `number` is the agent's first robot on the server.
+/// frame, so that it describes X_{k+1}. `number` is the server's number of the agent's first robot.
 pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result<bool> {
     if take_over_left(client, number, rollout)? {
         return Ok(true);
@@ -28,7 +28,7 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
             client.renew()?; // Recalling does not renew the lease.
         }
         if !recall(client, number, rollout, past)? {
-            client.renew()?; // Fails if another client holds the robot by now.
+            client.renew()?; // Fails if another client has taken the robot.
             break;
         }
     }
@@ -43,13 +43,13 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
     Ok(false)
 }
 
-/// Updates the belief of an agent that missed steps up to the present frame. The belief is then the posterior.
+/// Updates the belief of an agent that missed steps, up to and including the present frame, to the posterior.
 pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: Seen) -> Result<()> {
     let missed = rollout.step() + 1..seen.observation.world.step;
     if rollout.agent.policy().belief.input == Input::Frames {
         for past in missed {
             if !recall(client, number, rollout, past)? {
-                rollout.agent.predict(); // The server does not keep the step's frame.
+                rollout.agent.predict(); // The server has not kept the step's frame.
             }
         }
     }
@@ -57,7 +57,7 @@ pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: S
     Ok(())
 }
 
-/// Updates an agent's belief with the frame of an earlier step. Returns false if the server does not keep it.
+/// Updates an agent's belief with the frame of an earlier step. Returns false if the server has not kept it.
 fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) -> Result<bool> {
     let Ok(seen) = client.recall(number..number + 1, step) else {
         return Ok(false);
@@ -70,7 +70,7 @@ fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) ->
     Ok(true)
 }
 
-/// Replaces an agent's belief with the belief that was left for it. Returns whether there was one that fits.
+/// Replaces an agent's belief with the belief that was left for it. Returns false if no suitable belief was left.
 pub fn take_over_left(
     client: &mut Client,
     number: u32,
@@ -94,7 +94,7 @@ pub fn take_over_left(
     Ok(is_taken)
 }
 
-/// Leaves an agent's belief about X_{k+1}, after its last observation, for a robot's next agent.
+/// Leaves an agent's belief for the robot's next agent. The belief is about X_{k+1}, after the last observation.
 pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), ConnectionError> {
     let present = rollout.observation().world;
     let agent = &rollout.agent;

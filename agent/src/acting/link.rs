@@ -9,7 +9,7 @@ use emberwatch_protocol::{Client, Move};
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// The lease on some robots of a world, and the world's hidden states for oracles.
+/// The lease on some robots of a world. For oracles, also a feed of the world's hidden states.
 pub struct Link {
     pub client: Client,
     truth: Option<TruthFeed>,

@@ -20,7 +20,7 @@ use std::time::Duration;
 #[derive(Debug, Clone)]
 pub struct Mission {
     pub instance: Instance,
-    /// The task that the server must have, with its model unless the task is recorded; `None`: any worlds.
+    /// The task that the server must run, with its model unless the task is recorded. `None` accepts any worlds.
     pub task: Option<(Task, Option<Model>)>,
     pub world: u32,
     /// Numbers of the robots to fly in the world, on one belief.
@@ -30,7 +30,7 @@ pub struct Mission {
     pub policy: String,
     /// Steps to act for; 0: until stopped.
     pub steps: u64,
-    /// Minimum time from one step's start to the next. A stop takes effect only after it.
+    /// Minimum time from the start of one step to the start of the next. A request to stop waits until it has passed.
     pub shortest_step: Duration,
     pub takeover: bool,
     /// The model to use if the server does not reveal its own.
@@ -45,7 +45,7 @@ pub struct Mission {
 pub enum Cooperation {
     /// Ignores the other robots.
     Alone,
-    /// Uses the observations of all robots, and plans for its own.
+    /// Uses the observations of all robots, and plans only for the agent's own robots.
     Shared,
     /// Uses the observations of all robots, and plans for all. Agents with the same belief compute the same plan, and
     /// each flies its own part.
@@ -131,7 +131,8 @@ pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<Server
     Ok(info)
 }
 
-/// Returns the states of recorded worlds as a model in which they never change, if the server reveals them.
+/// Returns a model of recorded worlds, with their states and without transitions. Returns `None` for simulated worlds,
+/// or if the server does not reveal the recorded states.
 pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     let recorded = info.recorded_world.as_ref();
     let description = recorded.and_then(|recorded| recorded.description.as_deref());
@@ -178,7 +179,7 @@ pub(super) fn model_of(
     Ok(model)
 }
 
-/// Checks that a model for filters has the server's sensor and no-fly cells.
+/// Checks that a filter's model has the same sensor and no-fly cells as the server.
 fn check_sensor(info: &ServerInfo, model: &Model) -> Result<()> {
     let (expected, got) = (info.n_observations, model.n_observations());
     ensure!(
@@ -193,7 +194,7 @@ fn check_sensor(info: &ServerInfo, model: &Model) -> Result<()> {
     Ok(())
 }
 
-/// Checks that a model for filters has the states, rewards and sensor of recorded worlds.
+/// Checks that a filter's model has the same states, rewards and sensor as the recorded worlds.
 pub fn check_recorded(info: &ServerInfo, states: &Model, model: &Model) -> Result<()> {
     let [expected, got] = [states, model].map(|model| model.state_names().join(", "));
     ensure!(

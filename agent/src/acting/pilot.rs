@@ -49,15 +49,15 @@ struct Flyer {
     own: Range<u32>,
     /// Robots of each world.
     team: u32,
-    /// Duration of the last planning.
+    /// Time that the last plan took to compute.
     planning: Duration,
     feed: Feed,
-    /// Whether the next belief is the last, which is always published.
+    /// Whether the next belief is the last one. The last belief is always published.
     is_last: bool,
 }
 
 impl Pilot {
-    /// Acquires the robots in the present state of their world, and updates the belief with its last frame.
+    /// Acquires the robots in the present state of their world, and updates the belief with the world's latest frame.
     pub fn attach(mission: &Mission) -> Result<Self> {
         let info = info_of(&mission.instance, &mission.worlds())?;
         mission.check_task(&info)?;
@@ -69,7 +69,7 @@ impl Pilot {
         let policy = Policy::named(&mission.policy, &model)?;
         // An agent that cannot act must not take robots over from an agent that can.
         check(mission, &info, (&model, &policy), is_recorded)?;
-        // Simulating the prior may take long, so it comes before the lease, and is skipped if a belief was left.
+        // Simulating the prior can take long, so it precedes the lease. It is skipped if a former agent left a belief.
         if let Some(of_belief) = policy.belief.handover
             && is_belief_left(
                 &mission.instance,
@@ -91,7 +91,7 @@ impl Pilot {
         Ok(attached)
     }
 
-    /// Acquires the robots and takes over the belief left for the first of them. Returns `None` if it is outdated.
+    /// Acquires the robots and takes over the belief left for the first one. Returns `None` if the belief is outdated.
     fn continue_left(
         mission: &Mission,
         info: &ServerInfo,
@@ -184,9 +184,9 @@ impl Pilot {
         self.begin()
     }
 
-    /// Flies one step, in the next episode if the last one has ended. Returns the reward, or `None` if no path was
-    /// flown: because `stop` was set, or because the world stepped without the agent, which has caught up. The belief
-    /// after the last step is always published.
+    /// Flies one step, in the next episode if the last one has ended. Returns the reward. Returns `None` if no path was
+    /// flown, either because `stop` was set, or because the world stepped without the agent, which then catches up.
+    /// The belief after the last step is always published.
     pub fn step(
         &mut self,
         mission: &Mission,
@@ -236,7 +236,7 @@ impl Pilot {
 }
 
 impl Actor for Flyer {
-    /// Plans for its own robots, and for other robots that flew in the last step. Returns the own paths.
+    /// Plans for the agent's robots and for other robots that flew in the last step. Returns the paths of its robots.
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         let is_planned = self.is_planned();
@@ -273,20 +273,20 @@ impl Flyer {
         }
     }
 
-    /// Returns the last step's reward, summed over its own robots.
+    /// Returns the last step's reward, summed over the agent's robots.
     fn reward(&self) -> f64 {
         let own = self.own_indices();
         let results = self.rollout.results().skip(own.start).take(own.len());
         results.map(|result| result.reward).sum()
     }
 
-    /// Returns the indices of its own robots among all planned robots.
+    /// Returns the indices of the agent's robots among all planned robots.
     fn own_indices(&self) -> Range<usize> {
         let index = |number: u32| (number - self.robots.start) as usize;
         index(self.own.start)..index(self.own.end)
     }
 
-    /// Returns for each robot whether to plan for it: for its own robots, and for other robots that flew.
+    /// Returns, for each robot, whether to plan for it: true for the agent's robots and for other robots that flew.
     fn is_planned(&self) -> Vec<bool> {
         let (own, team) = (self.own_indices(), self.team);
         let hovered = self.rollout.observation().world.hovered;
@@ -339,7 +339,7 @@ fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -
     )?)
 }
 
-/// Creates an agent before its first frame. `seed` is the world's; `first` is the agent's first robot in the world.
+/// Creates an agent before its first frame. `seed` is the world's seed, and `first` is the agent's first robot there.
 fn agent(
     mission: &Mission,
     client: &Client,

@@ -13,13 +13,13 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(2);
 
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Summary {
-    /// Steps in which the agent's paths were flown.
+    /// Number of steps in which the agent's paths were flown.
     pub steps: u64,
-    /// Rewards of these steps, summed over the agent's robots.
+    /// Reward of these steps, summed over the agent's robots.
     pub reward: f64,
 }
 
-/// Acts in successive episodes until the steps are done or `stop` is set. If the server ends, waits for a new one.
+/// Acts in successive episodes until the steps are done or `stop` is set. If the server ends, waits for a new server.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut pilot = Pilot::attach(mission)?;
@@ -85,7 +85,7 @@ impl Report {
     }
 }
 
-/// Attaches again when the server has come back. Returns `None` if `stop` is set first.
+/// Waits for the server to come back, and attaches again. Returns `None` if `stop` is set first.
 fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Pilot>> {
     let mut mission = mission.clone();
     mission.takeover = false;

@@ -38,7 +38,7 @@ pub struct Arena {
     truth: Option<TruthFeed>,
     /// The worlds' model. For recorded worlds, a model whose states never change.
     model: Model,
-    /// The model given for beliefs on recorded worlds.
+    /// The model with which beliefs predict recorded worlds, if one was given.
     known: Option<Model>,
     main: Range<u32>,
     scouts: Range<u32>,
@@ -65,7 +65,7 @@ impl Arena {
         let claim = Claim {
             robots: 0..(used + u32::from(spare.is_some())) * team,
             takeover: false,
-            // Simulating the prior may take long. Closing the connection still ends the lease at once.
+            // Long, because simulating the prior can take long. Closing the connection still ends the lease at once.
             time_to_live: Some(LEASE),
         };
         let client = Client::acquire(connection, &claim)?;
@@ -111,10 +111,10 @@ impl Arena {
         self.known.as_ref().unwrap_or(&self.model)
     }
 
-    /// Gives beliefs a model for recorded worlds.
+    /// Sets the model with which beliefs predict recorded worlds.
     ///
     /// # Errors
-    /// If states, rewards or sensor differ from the worlds'.
+    /// If the model's states, rewards or sensor differ from those of the worlds.
     pub fn know(&mut self, model: Model) -> Result<()> {
         check_recorded(self.info(), &self.model, &model)?;
         self.known = Some(model);
@@ -147,10 +147,10 @@ impl Arena {
         self.info().n_robots as usize
     }
 
-    /// Sets the kind of team in which robots fly from now on.
+    /// Sets the kind of team for the following flights.
     pub fn fly_as(&mut self, team: Team) {
         self.crew = if team.is_joint() { self.n_robots() } else { 1 };
-        // With one robot per world, shared frames are the robot's own.
+        // With one robot per world, sharing frames changes nothing.
         self.client.share_frames(team != Team::Alone);
     }
 
@@ -190,7 +190,7 @@ impl Arena {
     /// Returns the hidden states at `step` from the scouts, before the main worlds reach that step.
     ///
     /// # Errors
-    /// Also if the server does not publish hidden states.
+    /// If the step fails, or if the server does not publish hidden states.
     pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let worlds = self.range(&self.scouts, seeds);
         let robots = self.robots(&worlds);
@@ -201,8 +201,8 @@ impl Arena {
         states.context("scouts need hidden states: start the server with --publish-truth")
     }
 
-    /// Returns what a robot that sees every cell would have observed in a seed's world at `step`, at least 1. Returns
-    /// `None` if the server has no spare world or does not serve full frames.
+    /// Returns what a robot that sees every cell would have observed in a seed's world at `step`, which is at least 1.
+    /// Returns `None` if the server has no spare world or does not serve full frames.
     pub fn full_observation(&mut self, seed: u64, step: u64) -> Result<Option<Grid<u8>>> {
         let Some(spare) = self
             .spare
@@ -245,7 +245,7 @@ impl Arena {
         building::agent(policy, config, &conditions, self.info().n_moves, seed)
     }
 
-    /// Refuses a policy that filters with a model, on worlds without a model.
+    /// Returns an error if the worlds have no model and the policy filters with one.
     pub fn check_model(&self, policy: &Policy) -> Result<()> {
         ensure!(
             !(self.lacks_model() && policy.belief.knows_model),
@@ -292,7 +292,7 @@ impl Arena {
     }
 }
 
-/// Main worlds of an arena as an environment. What agents see is ordered by world.
+/// Main worlds of an arena as an environment. Observations are ordered by world.
 pub struct Batch<'a> {
     arena: &'a mut Arena,
     seeds: &'a [u64],

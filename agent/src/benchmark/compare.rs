@@ -32,7 +32,7 @@ const ORACLE: &str = "oracle_beam";
 pub struct Comparison {
     /// The policies, in the order of the table.
     pub policies: Vec<Policy>,
-    /// Kinds of team. Each runs with each policy.
+    /// Kinds of team. Each policy runs with each kind.
     pub teams: Vec<Team>,
     pub seeds: Range<u64>,
     pub steps: u64,
@@ -41,7 +41,7 @@ pub struct Comparison {
     pub config: AgentConfig,
     /// Learned models, for policies that use them.
     pub learned: Learned,
-    /// Whether beliefs of a known model begin with each world's hidden state.
+    /// Whether known-model beliefs start from each world's hidden state.
     pub first_state_known: bool,
 }
 
@@ -49,7 +49,7 @@ pub struct Comparison {
 pub struct Results {
     /// One run per policy, team and world, in the order of the policies.
     pub runs: Vec<PolicyRun>,
-    /// Number of cells in the state that pays most, per step, averaged over worlds. The same for all policies.
+    /// Number of cells in the state with the highest reward, per step, averaged over worlds. The same for all policies.
     pub fire_cells: Vec<f32>,
     /// The last step of the first world's first robot, from the last policy with the highest [`Snapshot::rank`].
     pub snapshot: Option<Snapshot>,
@@ -243,7 +243,7 @@ impl Match<'_> {
         arena.agent(&self.contestant.policy, config, prior, agent, learned)
     }
 
-    /// Returns an agent's first belief, which is certain if the first state is known.
+    /// Returns an agent's first belief. If the first state is known, the belief is certain.
     fn prior(&self, arena: &Arena, seen: &Seen) -> Result<Cow<'_, Belief>> {
         if !self.comparison.first_state_known {
             return Ok(Cow::Borrowed(self.prior));
@@ -258,15 +258,15 @@ impl Match<'_> {
 
 /// The agents of a batch of worlds, and the measurements of each world.
 struct Players<'a> {
-    /// One for each agent, ordered by world.
+    /// One rollout per agent, ordered by world.
     rollouts: Vec<Rollout>,
     worlds: Vec<WorldRun>,
-    /// The last plans of each agent, and their duration.
+    /// Each agent's last plans, and the time that planning took.
     plans: Vec<(Vec<Plan>, Duration)>,
-    /// The state that pays most.
+    /// The state with the highest reward.
     target: usize,
     first_world: u32,
-    /// Robots of each world.
+    /// Number of robots per world.
     n_robots: usize,
     is_last: bool,
     feed: &'a mut Feed,
@@ -324,7 +324,7 @@ impl Players<'_> {
         }
     }
 
-    /// Publishes the posteriors of the agents that are due.
+    /// Publishes the posterior of each agent whose view is due.
     fn show(&mut self) {
         let (n_agents, n_robots) = (self.n_agents(), self.n_robots as u32);
         let crew = n_robots / n_agents as u32;
@@ -338,7 +338,7 @@ impl Players<'_> {
     }
 }
 
-/// Returns an agent's plans, and the duration of the planning.
+/// Returns an agent's plans, and the time that planning took.
 fn timed_plan(rollout: &mut Rollout) -> (Vec<Plan>, Duration) {
     let start = Instant::now();
     (rollout.plan(), start.elapsed())

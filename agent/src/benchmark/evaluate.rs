@@ -67,8 +67,8 @@ pub fn evaluate(arena: &mut Arena, evaluation: &Evaluation<'_>) -> Result<Vec<Sc
     Ok(scores)
 }
 
-/// Returns the score of predicting the same value frequencies for every cell. The frequencies are those seen through
-/// each sensor matrix in all worlds, known with hindsight.
+/// Returns the score of predicting the same value frequencies for every cell. The frequencies are counted in hindsight,
+/// over the observations of all worlds, separately for each sensor matrix.
 pub fn score_of_frequencies(all: &[Scores], counts: &[u64], n_matrices: usize) -> Score {
     let total = |value: usize| all.iter().map(|scores| scores.counts[value]).sum::<u64>();
     let totals: Vec<u64> = (0..counts.len()).map(total).collect();
@@ -139,7 +139,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frequencies_score_the_entropy_of_what_was_seen() {
+    fn score_of_frequencies_is_minus_their_entropy() {
         let scores = |counts: &[u64]| Scores {
             seed: 0,
             scores: Vec::new(),
@@ -149,7 +149,7 @@ mod tests {
         let score = score_of_frequencies(&all, &all[0].counts, 1);
         assert_eq!(score.n_seen, 4);
         assert!((score.mean() - 0.5_f64.ln()).abs() < 1e-12);
-        // Two matrices: the first shows both values alike, the second one alone.
+        // Two matrices: the first shows both values equally often, the second only one value.
         let all = [scores(&[3, 1, 8, 0]), scores(&[1, 3, 0, 0])];
         let score = score_of_frequencies(&all, &all[0].counts, 2);
         assert_eq!(score.n_seen, 12);

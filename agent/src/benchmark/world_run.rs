@@ -1,4 +1,4 @@
-//! The measurements of a world's run, from the flights and beliefs of each step to a row of the results.
+//! Measures one world's run: scores the flights and beliefs of each step, and sums them up in a row of the results.
 
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::benchmark::team::Team;
@@ -19,7 +19,7 @@ use std::time::Duration;
 pub struct WorldRun {
     pub seed: u64,
     pub tally: Tally,
-    /// Flights of the present step, until all robots have flown.
+    /// Flights of the present step, collected until all robots have flown.
     flights: Vec<Flight>,
     merit: MeritTally,
     pub snapshot: Option<Snapshot>,
@@ -29,12 +29,12 @@ pub struct WorldRun {
 #[derive(Default)]
 pub struct Tally {
     rewards: Vec<f32>,
-    /// Number of cells in the state that pays most, for each step.
+    /// Number of cells in the state with the highest reward, at each step.
     pub fire_cells: Vec<f32>,
     reward: f64,
     n_visited: u64,
     n_hits: u64,
-    /// Number of distinct cells of each robot, summed over robots.
+    /// Number of distinct cells that each robot visits in a step, summed over robots and steps.
     n_visited_each: u64,
     n_fire: u64,
     pub planning: Duration,
@@ -44,7 +44,7 @@ pub struct Tally {
 }
 
 impl WorldRun {
-    /// Starts the measurement of a world. `target` is the state that pays most.
+    /// Starts the measurement of a world. `target` is the state with the highest reward.
     pub fn new(seed: u64, shape: Shape, target: usize, recent_steps: u32) -> Self {
         Self {
             seed,
@@ -108,7 +108,7 @@ impl WorldRun {
         })
     }
 
-    /// Returns the row of the results.
+    /// Summarises the run as a row of the results.
     pub fn into_run(
         self,
         policy: &Policy,

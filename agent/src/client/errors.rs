@@ -44,7 +44,7 @@ mod tests {
     use std::time::Duration;
 
     #[test]
-    fn agents_wait_on_while_a_lock_is_held() {
+    fn agents_keep_waiting_while_a_lock_is_held() {
         let locked = ChannelError::Locked {
             path: "lock".into(),
             limit: Duration::ZERO,

@@ -16,7 +16,7 @@ pub fn connect(instance: &Instance) -> Result<Connection, ConnectionError> {
     Connection::open(instance, name, STEP_TIMEOUT)
 }
 
-/// Waits up to `limit` until an instance has a server, and logs the wait once. Returns false if `is_over` came first.
+/// Waits up to `limit` until an instance has a server, and logs the wait once. Returns false once `is_over` is true.
 pub fn wait_for_server(
     instance: &Instance,
     limit: Duration,
@@ -40,7 +40,7 @@ pub fn wait_for_server(
     Ok(false)
 }
 
-/// Returns whether a belief of this kind was left for a robot's next agent, about the present step. Needs no lease.
+/// Returns whether a belief of this kind about the present step was left for a robot's next agent. Needs no lease.
 pub fn is_belief_left(
     instance: &Instance,
     robot: u32,

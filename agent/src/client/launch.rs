@@ -1,4 +1,4 @@
-//! Servers and dashboards as child processes: found, started, waited for, and always stopped.
+//! Finds, starts, awaits and always stops servers and dashboards as child processes.
 
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_protocol::channels::Instance;
@@ -13,7 +13,7 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// How long a server or dashboard may take until it first answers.
+/// How long a starting server or dashboard may take to answer.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// How long a program may take to stop before it is killed.
@@ -161,7 +161,7 @@ fn private(program: PathBuf) -> Command {
     let mut command = Command::new(program);
     command
         .args(["--exit-with", &std::process::id().to_string()])
-        // Keeps a terminal's Ctrl-C from the program, which this process still needs while it stops.
+        // A terminal's Ctrl-C must not reach the program, because this process still needs it while stopping.
         .process_group(0);
     if std::env::var_os("RUST_LOG").is_none() {
         command.env("RUST_LOG", "warn");
@@ -169,7 +169,7 @@ fn private(program: PathBuf) -> Command {
     command
 }
 
-/// Returns the path of a program in this program's folder, or the bare name, to be found on PATH.
+/// Returns the path of a program in this program's folder, or otherwise the bare name, which is looked up on PATH.
 fn neighbour(name: &str) -> PathBuf {
     let neighbour = std::env::current_exe()
         .ok()

@@ -32,7 +32,7 @@ pub fn leave_belief(
     Ok(())
 }
 
-/// Returns the belief left for a robot's next agent about the world's present step, if it is of this kind.
+/// Returns the belief of this kind that was left for a robot's next agent about the world's present step, if any.
 pub fn left_belief(
     client: &mut Client,
     robot: u32,
@@ -57,7 +57,7 @@ pub fn left_belief(
                     return Ok(is_whole.then_some(bytes));
                 }
             }
-            // A belief of another kind, no belief, or a server without this request.
+            // The belief is of another kind, there is none, or the server does not know this request.
             Ok(Reply::Belief { .. }) | Err(ConnectionError::Refused { .. }) => return Ok(None),
             Ok(other) => return Err(unexpected("belief", &other)),
             Err(error) => return Err(error),

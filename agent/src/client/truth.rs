@@ -1,4 +1,4 @@
-//! The hidden states of a batch of worlds, for evaluation and oracles, never for learning.
+//! The hidden states of a batch of worlds. They serve evaluation and oracles, never learning.
 
 use anyhow::{Context, Result, bail};
 use emberwatch_protocol::channels::Instance;
@@ -27,7 +27,7 @@ impl TruthFeed {
 
     /// Returns the states of consecutive worlds at a step of the episodes with these seeds.
     ///
-    /// Skips samples of other worlds, steps and episodes, so each step must be read once, in order.
+    /// Samples of other worlds, steps and episodes are skipped for good, so each step must be read once, in order.
     pub fn states(&self, worlds: Range<u32>, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let mut states: Vec<Option<Grid<u8>>> = vec![None; worlds.len()];
         let deadline = Instant::now() + TIMEOUT;

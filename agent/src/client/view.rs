@@ -5,7 +5,7 @@ use emberwatch_protocol::feed::View;
 use std::ops::Range;
 use std::time::Duration;
 
-/// Returns an agent's belief and intent after a step. `planning` is the duration of its planning.
+/// Returns an agent's belief and intent after a step. `planning` is the time that planning took.
 pub fn view(rollout: &Rollout, world: u32, robots: Range<u32>, planning: Duration) -> View<'_> {
     View {
         world,

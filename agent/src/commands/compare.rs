@@ -33,7 +33,7 @@ use std::path::{Path, PathBuf};
 /// The name that stands for all policies of [`policy::options_table`].
 const OPTIONS: &str = "options";
 
-/// The default policy where teams are compared.
+/// The default policy for comparisons of teams.
 const TEAM_POLICY: &str = "beam_exploit";
 
 /// Compare policies on the same worlds.
@@ -44,7 +44,7 @@ pub struct CompareCommand {
     /// of policies from random to clairvoyant; with teams: beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
-    /// Policy with which the others are compared, paired by world [default: shooting_exploit; with options: the option
+    /// Policy to compare the other policies with, paired by world [default: shooting_exploit; with options: the option
     /// `exploit`; with teams: the first policy; on recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
@@ -147,7 +147,7 @@ impl CompareCommand {
         csv: Option<RunsFile>,
     ) -> Result<()> {
         let fits = check_fire(&added, &report.runs);
-        // The rows of this comparison are written even if the added rows do not fit.
+        // The rows of this comparison are written even if the added rows are refused.
         let added = if fits.is_ok() { added } else { Vec::new() };
         let all = [&*report.runs, &*added].concat();
         write(&render_table(&all, &report.baseline))?;
@@ -179,7 +179,7 @@ impl CompareCommand {
         Ok(added)
     }
 
-    /// Checks the rows of `--add` before a comparison runs, except rows for another number of robots in `--robots`.
+    /// Checks the rows of `--add` before a comparison runs. Skips rows that belong to another number of `--robots`.
     fn check_added(
         &self,
         added: &[PolicyRun],
@@ -209,7 +209,7 @@ impl CompareCommand {
         lock_csv(self.csv.as_deref())
     }
 
-    /// Returns the policies to run in an arena. If it lacks a model, the ladder keeps only policies that need none.
+    /// Returns the policies to run in an arena. If it has no model, the ladder keeps only policies that need none.
     fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
         let mut policies = self.policies(arena.model(), learned)?;
         if arena.lacks_model() && self.policies.is_empty() && !self.has_teams() {
@@ -332,7 +332,7 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     replace_file(&path, settings.as_bytes(), Readers::Any)
 }
 
-/// Returns each option, the rule and the learned choice, on the belief of the learned decisions.
+/// Returns one policy per option, the rule and the learned choice, all on the belief of the learned decisions.
 fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
     let decisions = learned.get::<LearnedDecisions>();
     let decisions =

@@ -118,7 +118,7 @@ impl LeaderboardCommand {
         entry.write(&path)
     }
 
-    /// Returns the flag's value, or the sum over the tasks of the value in their rows.
+    /// Returns the value of `--training-seconds`. Without the flag, sums the training seconds recorded for each task.
     fn training_seconds(&self, tasks: &[TaskRuns]) -> Result<f64> {
         if let Some(seconds) = self.training_seconds {
             return Ok(seconds);

@@ -67,7 +67,7 @@ pub struct SuiteCommand {
 }
 
 impl SuiteCommand {
-    /// Runs what is missing, and writes the scores of all policies.
+    /// Performs all missing trainings and runs, and writes the scores of all policies.
     pub fn run(&self) -> Result<()> {
         if asks_for_help(&self.policies) {
             return write(&policy::help());
@@ -184,7 +184,7 @@ impl SuiteCommand {
     }
 
     /// Trains what the policies of a task need, then runs each policy whose runs are missing or outdated. Returns all
-    /// valid runs. Leaves out policies that cannot run, with a warning.
+    /// valid runs. Warns about policies that cannot run, and leaves them out.
     fn carry_out(&self, plan: &Plan, trainings: Option<&Trainings<'_>>) -> Result<TaskRuns> {
         let mut ready = Vec::new();
         for policy in &plan.policies {
@@ -252,7 +252,7 @@ impl SuiteCommand {
     }
 }
 
-/// Ends the suite after a signal.
+/// Returns an error if a signal has asked the suite to stop.
 fn check_stop(trainings: Option<&Trainings<'_>>) -> Result<()> {
     ensure!(
         !trainings.is_some_and(Trainings::is_stopped),
@@ -283,7 +283,7 @@ impl Plan {
         self.lock()?.read()
     }
 
-    /// Reads a policy's checkpoints. With `trainings`, first trains what is missing.
+    /// Reads a policy's checkpoints. With `trainings`, first performs the missing trainings.
     fn prepare(&self, policy: &Policy, trainings: Option<&Trainings<'_>>) -> Result<Lesson> {
         ensure!(
             !(self.task.is_recorded() && policy.belief.knows_model),
@@ -325,7 +325,7 @@ impl Plan {
         true
     }
 
-    /// Reads all valid runs. Leaves out policies whose runs are invalid, with a warning.
+    /// Reads all valid runs. Warns about policies with invalid runs, and leaves them out.
     fn valid_runs(&self) -> Result<Vec<PolicyRun>> {
         let mut runs = self.read()?;
         let policies: BTreeSet<String> = runs.iter().map(|run| run.policy.clone()).collect();
@@ -340,7 +340,7 @@ impl Plan {
         Ok(runs)
     }
 
-    /// Checks that a policy's runs are of the task's worlds. For a built-in policy, also checks that its settings and
+    /// Checks that a policy's runs are from the task's worlds. For a built-in policy, also checks that its settings and
     /// checkpoint have not changed.
     fn check(&self, policy: &str, runs: &[PolicyRun]) -> Result<()> {
         let seeds = &self.comparison.seeds;

@@ -1,4 +1,4 @@
-//! `train`: learns a model while acting.
+//! `train`: trains a learner while it acts.
 
 use super::shared::{WaitFlag, make_folder, parse_seconds};
 use super::worlds::GridFlags;
@@ -24,10 +24,10 @@ use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-/// Default number of training worlds. A learner that follows a single world uses 1.
+/// Default number of training worlds, except for a learner that follows a single world.
 pub(super) const N_WORLDS: u32 = 16;
 
-/// Values of `--coverage`: whether frames show every cell, the name, and the help.
+/// Values of `--coverage`: for each, whether frames show every cell, its name, and its help text.
 const COVERAGES: [(bool, &str, &str); 2] = [
     (false, "path", "The cells in sight of the path"),
     (
@@ -216,8 +216,8 @@ impl TrainCommand {
         Ok(learned)
     }
 
-    /// Returns the checkpoint to resume, and adopts what it determines in the settings. Returns `None` without
-    /// `--resume`, and if an interrupted training of decisions had only trained the belief.
+    /// Returns the checkpoint to resume, and adopts the settings that it determines. Returns `None` without `--resume`,
+    /// or if a training of decisions was interrupted while it still trained the belief.
     fn contents(&self, training: &mut TrainingSpec) -> Result<Option<Contents>> {
         let kind = training.learner()?;
         if decides(kind)
@@ -271,7 +271,7 @@ impl TrainCommand {
         Ok(())
     }
 
-    /// Sets the estimator of the checkpoint. Refuses an `--estimator` that differs.
+    /// Adopts the checkpoint's estimator. Returns an error if `--estimator` differs.
     fn adopt_estimator(
         &self,
         expected: &'static BeliefKind,
@@ -298,7 +298,7 @@ impl TrainCommand {
         Ok(())
     }
 
-    /// Returns the instance to train on, and its server if it was started here. Dropping the server stops it.
+    /// Returns the instance to train on, and the server if this call started it. Dropping it stops the server.
     fn server(&self, training: &TrainingSpec) -> Result<(Instance, Option<OwnServer>)> {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
@@ -321,7 +321,7 @@ impl TrainCommand {
         let n_worlds = training.worlds.len() as u32;
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
         let episode_steps = (training.learner()?.episode_steps)(&training.config);
-        // A task sets the episode length itself.
+        // A task already determines the episode length.
         let episode_steps = episode_steps.filter(|_| self.grid.task.is_none());
         let episode = episode_steps.map(|steps| ["--max-steps".into(), steps.to_string()]);
         arguments.extend(episode.into_iter().flatten());
@@ -336,7 +336,7 @@ pub(super) fn start_server(
     mut arguments: Vec<String>,
     training: &TrainingSpec,
 ) -> Result<OwnServer> {
-    // A learner of a model must not see the true one.
+    // A learner that learns a model must not see the true model.
     let reveals = decides(training.learner()?) && training.belief()?.knows_model;
     let reveals = reveals.to_string();
     let rest = ["--reveal-model", &reveals, "--coverage", "client"];

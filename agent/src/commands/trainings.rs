@@ -1,6 +1,6 @@
 //! Trainings for the policies of a suite: finds their checkpoints, and runs missing trainings.
 //!
-//! `FOLDER/TASK` has a folder for each training: `filter`, `neural` and `autoencoder` for beliefs, and
+//! `FOLDER/TASK` contains a folder for each training: `filter`, `neural` and `autoencoder` for beliefs, and
 //! `decisions-BELIEF` for decisions on a belief. A policy that lacks its folder uses the checkpoint that `train --out
 //! FOLDER/TASK` wrote.
 
@@ -27,9 +27,9 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 #[derive(Debug, Default)]
 pub struct Lesson {
     pub learned: Learned,
-    /// Processor seconds of all its trainings; `None` if one training has no record.
+    /// Processor seconds of the policy's trainings; `None` if one of them has no record.
     pub seconds: Option<f64>,
-    /// Whether `suite --train` keeps it as it is: the policy needs no checkpoint, or the user ran `train`.
+    /// Whether `suite --train` trains no further: the policy needs no checkpoint, or the user ran `train`.
     pub is_final: bool,
     /// The learner of the last training and its world steps.
     steps: Option<(&'static LearnerKind, u64)>,
@@ -91,7 +91,7 @@ fn trainings(folder: &Path, policy: &Policy) -> impl Iterator<Item = (&'static s
     belief.into_iter().chain(decisions)
 }
 
-/// Reads the checkpoint of the last training, which includes the belief of the first. Adds up the seconds of all.
+/// Reads the last training's checkpoint, which includes the first training's belief. Adds up all processor seconds.
 fn read(folders: &[PathBuf]) -> Result<Lesson> {
     let seconds = folders.iter().map(|folder| seconds::read(folder));
     let seconds = seconds.collect::<Result<Vec<_>>>()?;

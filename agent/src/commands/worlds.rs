@@ -14,7 +14,7 @@ use emberwatch_protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
 
-/// The model of simulated worlds.
+/// The default model of simulated worlds.
 const DEFAULT_MODEL: &str = "wildfire";
 
 const BENCHMARK_BURN_IN: u64 = 25_000;
@@ -84,7 +84,7 @@ pub struct GridFlags {
     states_offset: u64,
 }
 
-/// An arena, and the server that was started for it, which stops when it is dropped.
+/// An arena, and the server if one was started for it. Dropping this value stops that server.
 pub struct Worlds {
     pub arena: Arena,
     _own: Option<OwnServer>,
@@ -186,7 +186,7 @@ fn robot_arguments(n_robots: u32) -> Vec<String> {
 }
 
 impl GridFlags {
-    /// Checks that the model fits the grid, and returns it. Recorded states have only the model given for beliefs.
+    /// Checks that the model fits the grid, and returns it. For recorded states, returns the beliefs' model, if any.
     pub fn check(&self) -> Result<Option<Model>> {
         let (model, height, width) = match &self.task {
             Some(task) if task.is_recorded() => return Ok(None),
@@ -201,7 +201,7 @@ impl GridFlags {
         Ok(Some(model))
     }
 
-    /// Returns the model given for beliefs on recorded states, with the server's sensor.
+    /// Returns the model with which beliefs predict recorded states, if one was given, with the server's sensor.
     pub fn model_of_states(&self) -> Result<Option<Model>> {
         let model = self.model.as_deref().filter(|_| self.states.is_some());
         let model = model.map(|model| with_sensor(model_named(model)?, self.radius()));

@@ -15,9 +15,9 @@ pub struct Acting<'a> {
     kind: &'static LearnerKind,
     feed: &'a mut Feed,
     robots: Range<u32>,
-    /// Robots of each world.
+    /// Number of robots per world.
     team: u32,
-    /// Duration of the last planning.
+    /// Time that the last plan took to compute.
     pub planning: Duration,
 }
 
@@ -38,7 +38,7 @@ impl<'a> Acting<'a> {
         }
     }
 
-    /// Publishes the posteriors of the robots that are due.
+    /// Publishes the posterior of each robot whose view is due.
     fn show(&mut self) {
         let planning = self.planning / self.robots.len().max(1) as u32;
         for index in self.feed.due(self.robots.len()) {

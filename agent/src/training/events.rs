@@ -23,7 +23,7 @@ impl Events {
         Ok(Self { file, n_ticks: 0 })
     }
 
-    /// Adds a step with one number per column, as TensorBoard shows one value per step.
+    /// Adds a step with one number per column, because TensorBoard shows one value per step.
     pub fn add(
         &mut self,
         tick: &Tick,

@@ -141,7 +141,7 @@ fn row(tick: &Tick, update: &ModelUpdate) -> Vec<String> {
     counts.into_iter().chain(numbers).collect()
 }
 
-/// Returns the numbers of a row, which follow its two counts.
+/// Returns the values of a row, without the two counts at its start.
 fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Option<f64>> + 'a {
     let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
     let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;
@@ -149,7 +149,7 @@ fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Opt
     numbers.into_iter().chain(update.more.iter().copied())
 }
 
-/// Returns a step's numbers by column, averaged over its updates. Omits `world_steps`, and columns without a number.
+/// Returns a step's values by column, averaged over its updates. Omits `world_steps`, and columns without a value.
 /// `more` names the learner's additional columns.
 pub fn averages(
     tick: &Tick,
@@ -211,7 +211,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn averages_are_over_the_updates_of_a_step() {
+    fn values_are_averaged_over_the_updates_of_a_step() {
         let update = |loss: f64, more: Option<f64>| ModelUpdate {
             number: 7,
             loss: Some(loss),

@@ -39,7 +39,7 @@ impl Stopwatch {
 /// Reads the processor seconds of the training in a folder; `None` if it recorded none.
 ///
 /// # Errors
-/// If the file holds anything but a finite number of at least 0.
+/// If the file contains anything but a finite number that is at least 0.
 pub fn read(folder: &Path) -> Result<Option<f64>> {
     let path = folder.join(SECONDS);
     if !path.exists() {

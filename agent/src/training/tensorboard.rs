@@ -1,6 +1,6 @@
 //! TensorBoard event files: numbers and images over steps, which TensorBoard reads while they grow.
 //!
-//! A file is a sequence of TensorFlow records: a length, the bytes, and a checksum after each of the two. The bytes
+//! A file is a sequence of TensorFlow records. A record has a length, its checksum, the bytes, and theirs. The bytes
 //! are protocol buffers of the types `Event` and `Summary`. Only a few of their fields are needed, so this module
 //! encodes them itself: the crate `tensorboard-rs` depends on protobuf 2 and image 0.23, which are long out of
 //! support. Steps must increase within a file: TensorBoard drops repeated steps.
@@ -16,7 +16,7 @@ const CASTAGNOLI: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
 const FILE_VERSION: &str = "brain.Event:2";
 
-/// `SessionLog.START`: TensorBoard discards earlier events of this and later steps, in older files too.
+/// `SessionLog.START`: TensorBoard discards all events written before, even in older files, for this and later steps.
 const SESSION_START: u64 = 1;
 
 /// Number of the colour space RGB in `Summary.Image`.
@@ -198,7 +198,7 @@ mod tests {
 
     /// By TensorBoard 2.21: `RecordWriter(out).write(Event(wall_time=1.5, ...).SerializeToString())`.
     #[test]
-    fn records_are_those_of_tensorboard() {
+    fn records_match_tensorboard() {
         // file_version="brain.Event:2"
         check(
             &event_at(1.5, 0).text(3, FILE_VERSION),
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn files_begun_in_one_second_sort_in_their_order() {
+    fn files_created_in_the_same_second_sort_in_order() {
         let folder = tempfile::tempdir().expect("a folder");
         let begin = || EventFile::begin(folder.path(), 0).expect("begun").path;
         let paths: Vec<PathBuf> = (0..12).map(|_| begin()).collect();
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_cannot_be_is_named() {
+    fn errors_name_a_folder_that_cannot_be_created() {
         let file = tempfile::NamedTempFile::new().expect("a file");
         let folder = file.path().join("events");
         let error = EventFile::begin(&folder, 0).expect_err("a file is no folder");

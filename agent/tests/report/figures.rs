@@ -1,4 +1,4 @@
-//! The worst cases of figures. The files stay in `target/tmp/report`, so that people can look at them.
+//! Draws the most demanding figures. The files stay in `target/tmp/report`, so that people can look at them.
 
 use super::synthetic::{ladder, noise, run, teams};
 use emberwatch_agent::benchmark::report::figures::FIRE_CELLS_PER_STEP as LABEL;
@@ -17,7 +17,7 @@ fn target(name: &str) -> PathBuf {
     directory.join(format!("{name}.svg"))
 }
 
-/// Draws a page, and checks that it is a small SVG file of this height which contains the texts.
+/// Draws a page, and checks that the result is a small SVG file of this height that contains the texts.
 fn check(name: &str, height: u32, texts: &[&str], draw: impl Fn(&Path) -> anyhow::Result<()>) {
     let path = target(name);
     draw(&path).expect("drawn");

@@ -1,4 +1,4 @@
-//! The CSV file of runs: several writers, old files, files that cannot be written.
+//! Tests of the CSV file of runs: several writers, old files, unwritable files.
 
 use super::synthetic::run;
 use emberwatch_agent::benchmark::report::RunsFile;

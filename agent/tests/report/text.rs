@@ -131,7 +131,7 @@ fn figures_of_merit_say_in_how_many_worlds_fire_was_detected() {
     let table = render_table(&runs, "coverage");
     assert!(table.contains("in the last 25 steps"), "{table}");
     // Errors: steps 1, 2, 3: sqrt(2 / 2 / 3) = 0.6. Seen 50, 70, 90 %: sqrt(800 / 2 / 3) = 11.5, also for differences.
-    // A world without a detection has no time, and without a front no distance. The oracle's rows are of an old file.
+    // A world has no time without a detection, and no distance without a front. The oracle's rows are from an old file.
     for expected in [
         "beam 3 of 3 2.0 ± 0.6 100.0 ± 0.0 70.0 ± 11.5 +40.0 ± 11.5 12.5 ± 0.0 50.0 ± 0.0",
         "coverage 2 of 3 40.0 ± 0.0 300.0 ± 0.0 30.0 ± 0.0 baseline - 50.0 ± 0.0",

@@ -1,4 +1,4 @@
-//! Checks of runs that are to be compared, and of the texts in leaderboard entries.
+//! Tests of the checks that runs are comparable, and that leaderboard entries contain only plain text.
 
 use super::synthetic::run;
 use emberwatch_agent::benchmark::report::PolicyRun;

@@ -6,7 +6,7 @@ import { whole } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 
-/** Connects the controls to `act`. `picture()` returns the shown picture. */
+/** Connects the controls to the actions `act`. `picture()` returns the shown picture. */
 export function createControls({ view, act }, picture) {
   const scrub = byId("scrub");
   const shownSerial = () => picture()?.shown?.serial ?? null;
@@ -73,7 +73,7 @@ function drawScrub({ kept, shown }, { at }) {
   scrub.min = kept.first;
   scrub.max = kept.last;
   const serial = shown?.serial ?? kept.last;
-  // Live, the page shows the newest belief, which may be a few steps old. The slider still stands at the end.
+  // In live mode, the page shows the newest belief, which may be a few steps old. The slider still stands at the end.
   scrub.value = at == null ? kept.last : serial;
   scrub.style.setProperty("--share", kept.last > kept.first ? (scrub.value - kept.first) / (kept.last - kept.first) : 1);
   scrub.setAttribute("aria-valuetext", `entry ${whole(serial)}, step ${whole(shown?.step)}${at == null ? ", newest" : ""}`);
@@ -87,7 +87,7 @@ function drawScrub({ kept, shown }, { at }) {
 
 function drawWorlds({ info }, view) {
   const select = byId("world");
-  // Before a server reports its worlds, only the requested one.
+  // Until a server reports its worlds, only the requested world can be selected.
   const [first, count] = info ? [0, Math.min(info.n_worlds, MAX_WORLDS)] : [view.world, 1];
   if (select.options.length !== count || select.options[0].value !== String(first)) {
     const numbers = Array.from({ length: count }, (_, i) => String(first + i));

@@ -18,12 +18,12 @@ export function swatch(color) {
   return square;
 }
 
-/** Sets an element's text only if it differs, because each change causes a new layout. */
+/** Sets an element's text only if the text differs, because each change causes a new layout. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** Returns a cleared canvas's context and size in device pixels; null while the canvas is hidden. */
+/** Clears a canvas. Returns its context and its size in device pixels; null while the canvas is hidden. */
 export function prepare(canvas) {
   const ratio = devicePixelRatio;
   const [width, height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio].map(Math.round);

@@ -1,4 +1,4 @@
-// The page's texts: state, note, facts, and what the page waits for.
+// Writes the page's texts: state, note, facts, and the notice while the page waits for a server or step.
 
 import { write } from "./elements.js";
 import { createRobots } from "./robots.js";
@@ -6,7 +6,7 @@ import { beliefAge, isTeam, short, stateNames, targetName, text, whole } from ".
 
 const byId = (id) => document.getElementById(id);
 
-/** Creates the writer of a picture's texts. */
+/** Creates the functions that write a picture's texts. */
 export function createFacts() {
   const announce = byId("announce");
   const robots = createRobots(byId("robots"));
@@ -45,7 +45,7 @@ export function createFacts() {
       drawEmpty(picture);
     },
     recovered() { isTroubled = false; },
-    /** Shows that the dashboard itself has gone. The last picture stays. */
+    /** Shows that the dashboard itself is gone. The last picture stays visible. */
     gone() {
       drawTrouble("gone", "The dashboard is gone; reconnecting every second.", "dashboard gone, reconnecting");
     },
@@ -63,7 +63,7 @@ function stateOf({ state, source, player }) {
   return player?.playing === false ? "paused" : "playing";
 }
 
-// Before the first server, the whole page says that it is waiting for one.
+// Until a server is found for the first time, a notice that fills the page says that it is waiting for one.
 function isToldLarge({ state, source, info }) {
   return state === "waiting" && source === "live" && !info;
 }
@@ -88,7 +88,7 @@ function drawServer({ info, status, lost, instance, source }) {
   drawLost(lost);
 }
 
-// Always shows lost frames, as zero is good news; shows other losses only if there are any.
+// Always shows the number of lost frames, because zero is good news. Shows other losses only if there are any.
 function drawLost(lost) {
   const others = [["truth", lost?.truth], ["beliefs", lost?.agent]].filter(([, count]) => count > 0);
   const words = others.map(([name, count]) => ` · ${name} ${whole(count)}`).join("");

@@ -1,11 +1,11 @@
-// One cell in numbers: the pointed-at cell, or by default the cell of the first robot.
+// Shows the values of one cell: the pointed-at cell, or by default the first robot's cell.
 
 import { make, swatch } from "./elements.js";
 import { NEVER, rampColor } from "./palette.js";
 import { cellsOf, hasLand, shapeOf } from "./wire.js";
 import { beliefAge, beliefNames, isTeam, observationNames, seenSince, stateNames } from "./words.js";
 
-// Time after the last key before the cell is announced, so that held keys do not flood a screen reader.
+// Time from the last key to the announcement of the cell, so that held keys do not flood a screen reader.
 const QUIET_MILLIS = 400;
 
 /** Creates the inspector: its element, and functions to draw and announce a cell. */
@@ -18,7 +18,7 @@ export function createInspector(announcer) {
   let timer = 0;
   let shownKey = "";
 
-  /** Draws `cell`, the pointed-at cell; if null, the first robot's. */
+  /** Draws `cell`, the pointed-at cell. If `cell` is null, draws the first robot's cell. */
   function draw(picture, cell, palette) {
     const at = cell ?? robotCell(picture);
     if (!at) return;
@@ -108,6 +108,6 @@ function rowElement({ name, value, color, share, ramp, kind }, palette) {
 function addBar(row, share, ramp, theme) {
   row.className = "has-bar";
   row.style.setProperty("--share", `${share * 100}%`);
-  // Starts at a third of the ramp, whose beginning would be invisible on the background.
+  // Starts at a third of the ramp, because its first colours would be invisible on the background.
   row.style.setProperty("--bar", `rgb(${rampColor(ramp, theme, 0.35 + 0.4 * share).join(" ")})`);
 }

@@ -1,16 +1,16 @@
-// Draws, in device pixels over the cells, the fixed features of the grid: lines around zones unless there are many, and
-// hatches over no-fly cells. Also draws the line around the observed cells. Each line is dark next to light, so that
-// one of the two is visible on any cell.
+// Draws lines over the cells, in device pixels: around zones unless there are many, hatches over no-fly cells, and
+// around the observed cells. Each line has a dark and a light stroke side by side, so that one of the two is visible on
+// any cell.
 
 import { NEVER } from "./palette.js";
 import { cellsOf, hasLand, shapeOf } from "./wire.js";
 
-/** Maximum number of zones with lines around them and names in the legend. */
+/** Maximum number of zones that get lines around them and names in the legend. */
 export const MAX_ZONES = 8;
 
-// Minimum size of a cell, in CSS pixels, that lines would not hide.
+// Minimum size of a cell, in CSS pixels, for lines. They would hide smaller cells.
 const MIN_LINE_CELL = 3;
-// Distance of a hatch's lines in CSS pixels. Each cell has a line, and most of its colour stays visible.
+// Distance between a hatch's lines in CSS pixels. Each cell has a line, and most of its colour stays visible.
 const HATCH = { min: 4, max: 9 };
 const DARK = "#141414";
 const LIGHT = "#ffffff";
@@ -49,7 +49,7 @@ function layerOf(frame, picture) {
   return layer;
 }
 
-// Draws a line between neighbouring cells for which `of` differs.
+// Draws a line between neighbouring cells for which `of` returns different values.
 function outline({ context, ratio, cell }, picture, of, line) {
   const { height, width } = shapeOf(picture);
   context.beginPath();

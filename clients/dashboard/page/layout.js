@@ -1,10 +1,10 @@
-// The size of the panels: as large as fits, with whole screen pixels per cell where that costs little. In the "regular"
-// layout, the truth, the observations and the inspector form the first row; the beliefs and the entropy form the
-// second. Otherwise the panels follow each other, and the inspector comes last.
+// Makes the panels as large as fits. Uses whole screen pixels per cell if that makes the panels only a little smaller.
+// In the "regular" layout, the truth, the observations and the inspector form the first row; the beliefs and the
+// entropy form the second. Any other layout places all panels in order, and the inspector last.
 
-// A whole number of pixels per cell is crisper, if the panel keeps at least this share of its size.
+// A whole number of pixels per cell is crisper. It is used if the panel then keeps at least this share of its size.
 const WORTHWHILE = 0.8;
-// A regular layout reads best: another layout must be larger by this factor to be chosen.
+// A regular layout reads best. Another layout is chosen only if its panels are larger by this factor.
 const REGULAR_MERIT = 1.15;
 // Sizes in rem, as in the style sheet: the inspector's title, one of its lines, its columns of lines and the gap
 // between them, the minimum width of a panel's column (for the caption), and the note in place of beliefs.
@@ -14,15 +14,15 @@ const LANE = 9;
 const LANE_GAP = 1.2;
 const CAPTION_WIDTH = 8;
 const NOTE = 5;
-// Minimum panel width in rem: below it, the panels keep a readable size, and scroll.
+// Minimum panel width in rem. If the panels do not fit at this width, they keep a readable size and the page scrolls.
 const MIN_WIDTH = 4;
 // Number of panels before the inspector in a regular layout.
 const OBSERVED = 3;
 
 /**
  * Returns the best layout of panels within `area`: columns, the panels' size in CSS pixels, the inspector's span.
- * `places` counts the panels, the inspector's lines and the columns of a regular layout. `isBare` means that a note
- * replaces the beliefs. In an area of height Infinity, the page scrolls, and the layout has `forced` columns.
+ * `places` has the numbers of panels, of inspector lines and of columns in a regular layout. If `isBare` is set, a note
+ * replaces the beliefs. If the area's height is Infinity, the page scrolls, and the layout has `forced` columns.
  */
 export function fit({ area, shape, places, forced, gap, caption, ratio, rem }) {
   const minimum = CAPTION_WIDTH * rem + gap;
@@ -76,7 +76,7 @@ export function createLayout({ stage, field, panels }, places) {
   let sizes = "";
 
   function layOut(shape) {
-    // Legends need more lines next to fewer columns, so the layout uses their greatest height.
+    // Narrower layouts wrap legends into more lines, so the calculation assumes the legends' greatest height.
     stage.style.removeProperty("--field-width");
     let others = -1;
     for (let used = usedByOthers(); used > others; used = usedByOthers()) {
@@ -105,7 +105,7 @@ export function createLayout({ stage, field, panels }, places) {
     apply(best, gap, isStacked ? share : Math.max(best.width, CAPTION_WIDTH * rem));
   }
 
-  // Returns the height of everything but the panels.
+  // Returns the height of everything except the panels.
   function usedByOthers() {
     const rowGap = parseFloat(getComputedStyle(field).rowGap);
     const others = [...field.children].filter((child) => child !== panels && child.offsetHeight > 1);

@@ -5,7 +5,7 @@ import { MAX_ZONES } from "./land.js";
 import { rampStops } from "./palette.js";
 import { beliefNames, observationNames, stateNames } from "./words.js";
 
-// Maximum number of names: more would leave no space for the panels.
+// Maximum number of names. More names would leave no space for the panels.
 const MAX_NAMES = 16;
 
 /** Creates the legends above and below the panels, which are redrawn only when they change. */

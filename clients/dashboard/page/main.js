@@ -1,4 +1,4 @@
-// Connects the parts of the page: a picture arrives, is drawn, and the next one is requested. Reading order: wire.js,
+// Connects the parts of the page: receives a picture, draws it, and requests the next one. Reading order: wire.js,
 // socket.js, view.js, then the drawing: panels.js, charts.js, facts.js, controls.js.
 
 import { createCharts } from "./charts.js";
@@ -50,7 +50,7 @@ const link = connect({
 function show(next) {
   picture = next;
   facts.recovered();
-  // A restarted server counts entries from the start, so the entry looked at no longer exists.
+  // A restarted server counts entries from the start again, so the selected entry no longer exists.
   if (view.at != null && next.kept && view.at > next.kept.last) view.at = null;
   // A link may name a world that this server lacks.
   if (next.info && view.world >= next.info.n_worlds) act.world(0);
@@ -59,7 +59,7 @@ function show(next) {
   window.emberwatch.drawn += 1;
 }
 
-// Every picture may fail in the same way: the page shows the error while it lasts, the console logs it once.
+// Pictures may keep failing in the same way. The page shows the error as long as it lasts; the console logs it once.
 function failed(error) {
   facts.failed(error);
   if (!hasFailed) console.error(error);
@@ -103,6 +103,6 @@ function byKey(cell) {
 }
 
 addEventListener("resize", redraw);
-// Any element that changes its size changes the size of one of these two.
+// Whenever any element changes its size, one of these two elements does, too.
 const sizes = new ResizeObserver(redraw);
 for (const element of [document.body, byId("stage")]) sizes.observe(element);

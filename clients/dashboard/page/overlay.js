@@ -51,7 +51,7 @@ function drawPath(frame, { path, color }) {
   context.lineJoin = "round";
   context.lineCap = "round";
   const width = Math.min(Math.max(cell.x * 0.26, ratio), 3 * ratio);
-  // Where cells are one or two pixels wide, the line is seen mostly against the background.
+  // Where cells are one or two pixels wide, the line mostly covers the background instead of cells.
   const dark = cell.x < 2 * ratio ? ink : DARK;
   stroke(context, color ? width + ratio : width, dark);
   if (color) stroke(context, width, color);
@@ -74,7 +74,7 @@ function drawStart(frame, { path: [place], color }) {
   context.strokeRect(x - side / 2, y - side / 2, side, side);
 }
 
-// A robot that stayed is hollow: a full ring if it hovered, a dashed ring if it was late.
+// A robot that stayed is drawn hollow: as a full ring if it hovered, as a dashed ring if it was late.
 function drawRobot(frame, { cell: place, state, color = LIGHT, label }) {
   const { context, ratio, cell } = frame;
   const radius = Math.max(cell.x * 0.85, (label ? 8 : 5) * ratio);
@@ -107,7 +107,7 @@ function disc(context, x, y, radius, color) {
   context.fill();
 }
 
-// A light line next to each dark one, so that one of the two is visible on any cell.
+// Draws a light line next to each dark line, so that one of the two is visible on any cell.
 function drawCross({ context, ratio, width, height, cell }, { row, col }) {
   const left = Math.round(col * cell.x);
   const top = Math.round(row * cell.y);

@@ -1,8 +1,8 @@
 // Colours of states, observations, beliefs and objectives, and the tables that convert array values to pixels.
-// Lightness carries the order, so that everything can be read in grey too.
+// Values are ordered by lightness, so that everything remains readable in greyscale.
 
-// Colours for hidden models: the wildfire's three, then colours that remain distinct under the common colour
-// blindnesses (Okabe and Ito 2008, with a brown instead of their orange).
+// Colours for hidden models: the wildfire model's three, then colours that remain distinct under the common forms of
+// colour blindness (Okabe and Ito 2008, with a brown instead of their orange).
 const COLORS = ["#3b6ea5", "#e3b23c", "#c8371b", "#009e73", "#cc79a7", "#56b4e9", "#8c510a", "#f0e442"];
 
 // Greys for cells that were not observed, the preferred one first.
@@ -43,8 +43,8 @@ const OBJECTIVES = ["#8a63b8", "#009e73", "#cc79a7", "#56b4e9", "#8c510a"];
 /** The byte that means "not observed" in grids. */
 export const NEVER = 255;
 
-// Old observations fade: each keeps this share of its colour, and the rest halves in this number of steps. So old cells
-// stay readable, and the last few steps stand out.
+// Old observations fade: each keeps OLDEST_SHARE of its colour, and the rest of its colour halves every HALF_AGE steps.
+// So old cells stay readable, and the last few steps stand out.
 const OLDEST_SHARE = 0.4;
 const HALF_AGE = 24;
 
@@ -53,9 +53,9 @@ const HALF_AGE = 24;
 const ZONE_SHARE = 0.4;
 
 /**
- * Returns the colours of a picture's model under a theme: `states` and `observations` as "#rrggbb" by any byte,
- * `unseen`, and tables of pixels: `stateTable` and `frameTable` by value, `seenTable` by `value * 256 + age`,
- * `rampTable(name)` by value 0..255. For cells not observed: `unseenZones` and `zoneTable` by zone.
+ * Returns the colours of a picture's model under a theme. `states` and `observations` have a "#rrggbb" for any byte;
+ * `unseen` is a single colour. The tables of pixels are `stateTable` and `frameTable`, indexed by value, `seenTable` by
+ * `value * 256 + age`, `rampTable(name)` by 0..255. For cells not observed: `unseenZones` and `zoneTable`, by zone.
  */
 export function paletteOf(picture, theme) {
   const { state_colours: states, observation_colours: observations, n_named: named, zone_colours: zones } = picture.info ?? {};
@@ -84,7 +84,7 @@ function make({ states: ownStates, observations: ownObservations, named, zones, 
   };
 }
 
-/** Returns the colour of an objective: the colour of the state of this name, or one of its own. */
+/** Returns the colour of an objective: the colour of the state with this name, or otherwise a separate colour. */
 export function objectiveColor(name, { objectives, names, palette }) {
   if (name === IDLE.name) return IDLE.color;
   const state = names.indexOf(name);
@@ -117,7 +117,7 @@ export function rampStops(name, theme) {
   return RAMPS[name][theme];
 }
 
-// Returns a colour for each byte: the model's own colours first, then the colours of this file.
+// Returns a colour for each byte: first the model's colours, then the colours of this file.
 function colorsOf(own) {
   return Array.from({ length: 256 }, (_, at) => own?.[at] ?? COLORS[at] ?? generated(at));
 }
@@ -136,7 +136,7 @@ function hexadecimal(channel) {
   return channel.toString(16).padStart(2, "0");
 }
 
-/** Returns the first grey that is distinct from all colours, or else the most distant grey. */
+/** Returns the first grey that is distinct from all colours, or otherwise the most distant grey. */
 function unlike(colors, greys) {
   const nearest = (grey) => Math.min(...colors.map((color) => distance(color, grey)));
   return greys.find((grey) => nearest(grey) >= APART)
@@ -161,7 +161,7 @@ function blend(from, to, share) {
   return from.map((channel, i) => Math.round(channel + (to[i] - channel) * share));
 }
 
-// Builds a table of pixels as in canvas image data on little-endian machines, on which all browsers run.
+// Builds a table of pixels with the byte order of canvas image data. Assumes a little-endian machine, as browsers have.
 function table(length, color) {
   const pixels = new Uint32Array(length);
   for (let i = 0; i < length; i += 1) {

@@ -13,7 +13,7 @@ const OBSERVED = [
 ];
 const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of the belief" };
 
-/** Creates the panels and the inspector in `parent`. `byKey(cell)` is called when keys select a cell, or null. */
+/** Creates the panels and the inspector in `parent`. Calls `byKey(cell)` when keys select a cell, or null for none. */
 export function createPanels(parent, { pointer, byKey, inspector }) {
   let built = { key: "", world: null, beliefs: [], panels: [], landLines: 0 };
   // The cell selected by keys, until the pointer moves over a panel.
@@ -21,7 +21,7 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
   const hold = (cell) => { keyed = cell; byKey(cell); };
   const release = () => { keyed = null; };
 
-  /** Rebuilds the panels when their number, names or shape change. Returns whether it did. */
+  /** Rebuilds the panels if their number, names or shape have changed. Returns whether it rebuilt them. */
   function build(picture) {
     const beliefs = namesOf(picture);
     const landLines = hasLand(picture) ? 1 : 0;
@@ -39,7 +39,7 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
     return true;
   }
 
-  // Agents publish a belief only for some entries, so the panels stay for entries without one.
+  // Agents publish a belief only for some entries, so belief panels stay for entries without a belief.
   function namesOf(picture) {
     const names = beliefNames(picture);
     if (names.length > 0 || picture.objectives.length === 0) return names;
@@ -48,7 +48,7 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
 
   return {
     build,
-    /** For the layout: panels, inspector lines, whether a note replaces beliefs, columns if they are in one row. */
+    /** Returns what the layout needs: panels, inspector lines, whether a note replaces beliefs, regular columns. */
     places: () => ({
       panels: built.panels.length,
       lines: OBSERVED.length + built.landLines + (built.beliefs.length && built.beliefs.length + 1),

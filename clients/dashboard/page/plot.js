@@ -4,23 +4,23 @@ import { prepare } from "./elements.js";
 import { NEVER } from "./palette.js";
 import { extent, tickText, ticks } from "./scale.js";
 
-// Sizes relative to the canvas's font size: minimum width of the ticks' texts left of a plot, and space next to a text.
+// Sizes relative to the canvas's font size: minimum width of the tick labels left of a plot, and space next to a label.
 const LEFT = 3.1;
 const SPACE = 0.5;
-// Agents publish only some steps. A line bridges the gap between two samples, unless the gap is this many times the
-// usual one.
+// Agents publish only some steps. A line bridges the gap between two samples, unless the gap is longer than this many
+// usual gaps.
 const LONG = 4;
-// Half of a tick's text, which extends above and below its line.
+// Half the height of a tick label, which extends above and below its line.
 const MARGIN = 0.6;
-// Minimum distance between two ticks, vertically and horizontally, so that their texts stay apart.
+// Minimum distances between two ticks, vertically and horizontally, so that their labels stay apart.
 const TICK = 2.7;
 const STEP_TICK = 5.8;
 // Height of the text below the strip.
 const STEPS = 1.7;
 
 /**
- * Clears a chart's canvas. Returns its context and sizes, and vertical ticks for `values` at least `apart` apart, if
- * there are values. Returns null while the canvas is hidden.
+ * Clears a chart's canvas. Returns its context and sizes, and if there are `values`, vertical ticks for them that are
+ * at least `apart` apart. Returns null while the canvas is hidden.
  */
 export function frameOf(canvas, values, apart = 0) {
   const drawn = prepare(canvas);
@@ -35,12 +35,12 @@ export function frameOf(canvas, values, apart = 0) {
   return values ? { ...frame, rows: rowsOf(frame, values, apart) } : frame;
 }
 
-/** Returns the width, in CSS pixels, to keep left of plots with a shared axis below; `word` names the axis. */
+/** Returns the width, in CSS pixels, of the space left of plots that share an axis. `word` names the axis. */
 export function roomFor(frames, word) {
   return Math.max(0, ...frames.filter(Boolean).map(({ context, em, rows }) => {
     const width = (text) => context.measureText(text).width;
     const widest = Math.max(...(rows?.map(({ label }) => width(label)) ?? [0]));
-    // The first step's text may begin before the plot.
+    // The first step's label may begin to the left of the plot.
     return Math.max(LEFT * em, widest + 1.2 * SPACE * em, width(word) + (SPACE + 1) * em);
   }));
 }
@@ -141,7 +141,7 @@ function drawSteps(frame, axis) {
   }
 }
 
-/** Returns the bins with values, grouped into runs that a line joins. Long gaps separate runs. */
+/** Returns the bins with values, grouped into runs. A line joins the bins of a run; long gaps separate runs. */
 function runsOf(values, isKnown, bridge) {
   const known = [...values.keys()].filter((bin) => isKnown(values[bin]));
   const gap = Math.max(bridge, LONG * usualGap(known));
@@ -159,7 +159,7 @@ function usualGap(known) {
   return gaps[gaps.length >> 1] ?? 1;
 }
 
-/** Returns blocks of one objective. Each lasts until the run's next sample of another objective. */
+/** Returns blocks of one objective. A block lasts until the run's next sample with another objective. */
 function blocksOf(values, bridge) {
   const blocks = [];
   for (const run of runsOf(values, (value) => value !== NEVER, bridge)) {

@@ -1,6 +1,6 @@
-// The pointer's position. The elements under a resting pointer may change, so every drawing looks them up again.
+// The pointer's position. The element under a resting pointer may change, so it is looked up anew for every drawing.
 
-/** Follows the pointer. Calls `changed()` when another element may lie under it. */
+/** Follows the pointer. Calls `changed()` when the element under the pointer may have changed. */
 export function createPointer(changed) {
   let at = null;
 
@@ -17,7 +17,7 @@ export function createPointer(changed) {
   addEventListener("scroll", () => at && changed(), { capture: true, passive: true });
 
   return {
-    /** Returns the visible one of `elements` under the pointer: { element, clientX, clientY }, or null. */
+    /** Returns the visible element of `elements` under the pointer: { element, clientX, clientY }, or null. */
     on(elements) {
       const top = at && document.elementFromPoint(at.clientX, at.clientY);
       const element = top && elements.find((candidate) => candidate.contains(top));

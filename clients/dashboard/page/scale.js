@@ -1,4 +1,4 @@
-// Axes: positions of ticks, and positions of serials across a chart.
+// Axes: positions of ticks, and positions of serial numbers across a chart.
 
 /** Returns about `count` ticks that cover `low..high`, spaced by 1, 2 or 5 times a power of ten. */
 export function ticks(low, high, count) {
@@ -10,7 +10,7 @@ export function ticks(low, high, count) {
   return { at, step };
 }
 
-/** Returns a tick's text, with the digits that the step between ticks needs. */
+/** Returns a tick's label, with as many digits as the step between ticks needs. */
 export function tickText(value, step) {
   if (Math.abs(value) >= 10000 && step >= 1000) return `${Math.round(value / 100) / 10}k`;
   return value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
@@ -26,7 +26,7 @@ export function extent(values) {
   return low > high ? null : { low, high };
 }
 
-/** Returns functions that map a series' serials to positions across a chart, and to steps. */
+/** Returns functions that map a series' serial numbers to positions across a chart, and to steps. */
 export function across(series) {
   const { first, last, bins } = series;
   const count = last - first + 1;
@@ -41,9 +41,9 @@ export function across(series) {
     share: (serial) => (serial - first + 0.5) / count,
     at: (share) => Math.min(Math.max(Math.floor(first + share * count), first), last),
     bin: (serial) => Math.floor(((serial - first) * bins) / count),
-    /** Returns a bin's position: with fewer entries than bins, the position of its entry. */
+    /** Returns a bin's position. If there are fewer entries than bins, returns the position of its entry. */
     binShare: (bin) => (count < bins ? Math.ceil((bin * count) / bins) + 0.5 : ((bin + 0.5) * count) / bins) / count,
-    // With fewer entries than bins, some bins are empty without being gaps.
+    // If there are fewer entries than bins, some bins are empty without being gaps.
     bridge: Math.ceil(bins / count),
   };
 }

@@ -6,13 +6,13 @@ import { decode } from "./wire.js";
 const RETRY_MILLIS = 1000;
 // The dashboard answers within half a second, so a connection that is silent for this long is dead.
 const SILENCE_MILLIS = 6000;
-// One request waits for changes; a second one may be under way, so that scrubbing need not wait.
+// One request waits for changes. A second request can be pending at the same time, so that scrubbing need not wait.
 const MAX_REQUESTS = 2;
 
 /**
  * Keeps a connection up for as long as the page lives.
  * `ask()` returns the next request. `show(picture)` draws a picture. `superseded(picture)` returns whether to skip a
- * picture for which a newer request is under way. `up(isUp)` is called when the connection is made or lost, and
+ * picture because a newer request is pending. `up(isUp)` is called when the connection is made or lost, and
  * `failed(error)` when a picture cannot be read.
  */
 export function connect({ ask, show, superseded, up, failed }) {
@@ -22,7 +22,7 @@ export function connect({ ask, show, superseded, up, failed }) {
   let watchdog = 0;
 
   function open() {
-    // Next to the page: a proxy may serve it below a path, and with TLS.
+    // The address is relative to the page, because a proxy may serve the page below a path, and with TLS.
     const address = new URL("socket", location.href);
     address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
     socket = new WebSocket(address);
@@ -68,7 +68,7 @@ export function connect({ ask, show, superseded, up, failed }) {
     }
   }
 
-  /** Sends a request at once, because the wanted picture has changed. */
+  /** Sends a request at once. Called when the visitor wants another picture. */
   function hurry() {
     if (socket?.readyState !== WebSocket.OPEN) return;
     if (asked < MAX_REQUESTS) send();

@@ -16,7 +16,7 @@ export function createView({ asks, changed, worlds }) {
     ...read(),
     /** Serial of the entry to look at; null for the newest. */
     at: null,
-    /** For the next request only: a recording's speed, and whether it plays. */
+    /** For the next request only: a recording's new speed, and whether to play it. */
     player: { speed: null, playing: null },
   };
 

@@ -26,7 +26,7 @@ export function decode(buffer) {
 
 /**
  * Returns the height and width of the grids in a picture, or null before they are known. The shown entry's shape
- * takes precedence, as the server may be a new one with another grid.
+ * takes precedence, because the entry may come from an earlier server with another grid.
  */
 export function shapeOf(picture) {
   const of = picture?.shown?.height ? picture.shown : picture?.info;
@@ -54,7 +54,7 @@ function header(buffer) {
   return { text: new TextDecoder().decode(new Uint8Array(buffer, 4, length)), end };
 }
 
-// Refuses a grid of another size, which would be drawn askew.
+// Throws if a grid has another size, because it would be drawn askew.
 function checkGrids(picture, arrays) {
   const cells = cellsOf(picture);
   if (!cells) return;

@@ -5,7 +5,7 @@ import { cellsOf } from "./wire.js";
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const UNKNOWN = "–";
 
-/** Formats a whole number with separators of thousands; a dash if it is unknown. */
+/** Formats a whole number with thousands separators; a dash if the number is unknown. */
 export function whole(value) {
   return value == null || Number.isNaN(value) ? UNKNOWN : WHOLE.format(value);
 }
@@ -18,7 +18,7 @@ export function short(value) {
   return value.toFixed(size >= 10 ? 1 : size >= 1 ? 2 : 3);
 }
 
-/** Returns text, or a dash if there is none. */
+/** Returns the text, or a dash if there is none. */
 export function text(value) {
   return value == null || value === "" ? UNKNOWN : String(value);
 }
@@ -33,7 +33,7 @@ export function observationNames(picture) {
   return picture.info?.observations ?? [];
 }
 
-/** Returns the names of the belief's states, which a learned filter may define itself. Empty without a belief. */
+/** Returns the names of the belief's states, which can be a learned filter's states. Empty without a belief. */
 export function beliefNames(picture) {
   const { belief } = picture.arrays;
   if (!belief || !picture.info) return [];
@@ -47,7 +47,7 @@ export function isTeam(shown) {
   return shown?.robots.length > 1;
 }
 
-/** Returns the name of the state that pays most. */
+/** Returns the name of the state with the highest reward. */
 export function targetName(picture) {
   const target = picture.info?.target_state;
   return target == null ? "target" : stateNames(picture)[target] ?? "target";

@@ -1,9 +1,9 @@
-//! Decides which requests are answered: only those of the dashboard's own page.
+//! Decides which requests are answered: only requests from the dashboard's own page.
 //!
-//! The `Host` must be an address, `localhost` or a name given with `--name`: otherwise the owner of any other name
-//! could point it at this machine and read the page as a page of that name (DNS rebinding). The `Origin`, which
-//! browsers add to a WebSocket's handshake, must have the same host and port; its scheme is `https` where a proxy adds
-//! TLS. `X-Forwarded-*` and `Forwarded` are ignored, because a page on a rebound name could set them.
+//! The `Host` must be an address, `localhost` or a name given with `--name`. Without this check, a site's owner could
+//! point the site's name at this machine, and the site's scripts could read the page (DNS rebinding). The `Origin`,
+//! which browsers add to a WebSocket's handshake, must have the same host and port; its scheme is `https` where a proxy
+//! adds TLS. `X-Forwarded-*` and `Forwarded` are ignored, because a page on a rebound name could set them.
 
 use axum::http::HeaderMap;
 use axum::http::header::{HOST, HeaderName, ORIGIN};
@@ -20,7 +20,7 @@ struct Place {
     port: Option<u16>,
 }
 
-/// Checks that a request may have come from the dashboard's page. `names` are host names under which browsers may reach
+/// Checks that a request can have come from the dashboard's page. `names` are host names under which browsers can reach
 /// the dashboard.
 ///
 /// # Errors
@@ -42,7 +42,7 @@ pub fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
     }
 }
 
-/// Parses a host name of `--name`.
+/// Parses a host name given with `--name`.
 ///
 /// # Errors
 /// A sentence about the problem, if the text is not a host name, for example a URL.
@@ -78,8 +78,8 @@ impl Place {
         self.is_address || self.name == "localhost" || names.iter().any(is_own)
     }
 
-    /// Returns whether pages of an origin came from this place. A missing port is the default of the origin's scheme: a
-    /// proxy may forward `fire.example`, `fire.example:443` or neither.
+    /// Returns whether an origin is this place. A missing port stands for the default port of the origin's scheme,
+    /// because a proxy may forward the host without its port.
     fn has_origin(&self, origin: &str) -> bool {
         let (default_port, rest) = match origin.split_once("://") {
             Some(("http", rest)) => (80, rest),
@@ -96,7 +96,7 @@ mod tests {
     use super::*;
     use axum::http::HeaderValue;
 
-    /// Returns whether a request is answered under `--name Lab.example`.
+    /// Returns whether a request is answered if the dashboard was started with `--name Lab.example`.
     fn answered(host: &'static str, origin: Option<&'static str>) -> bool {
         let mut headers = HeaderMap::new();
         headers.insert(HOST, HeaderValue::from_static(host));
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn hosts_that_nobody_else_can_point_here_are_answered() {
+    fn only_hosts_safe_from_rebinding_are_answered() {
         for host in [
             "127.0.0.1:8600",
             "10.0.0.7",
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_of_the_same_host_and_port_are_answered_with_tls_or_without() {
+    fn same_host_and_port_are_answered_with_and_without_tls() {
         for (host, origin) in [
             ("127.0.0.1:8600", "http://127.0.0.1:8600"),
             ("127.0.0.1:8600", "https://127.0.0.1:8600"),
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_of_other_places_are_refused() {
+    fn other_origins_are_refused() {
         for (host, origin) in [
             ("127.0.0.1:8600", "http://evil.example"),
             ("127.0.0.1:8600", "http://127.0.0.1:8601"),
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn forwarded_headers_change_nothing() {
+    fn forwarded_headers_are_ignored() {
         for name in ["x-forwarded-host", "x-forwarded-proto", "forwarded"] {
             let mut headers = HeaderMap::new();
             headers.insert(HOST, HeaderValue::from_static("evil.example"));
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_has_neither_scheme_nor_port() {
+    fn host_names_have_neither_scheme_nor_port() {
         assert_eq!(host_name("fire.example"), Ok("fire.example".into()));
         for wrong in [
             "",

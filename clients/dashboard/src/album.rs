@@ -10,14 +10,14 @@ use std::time::{Duration, Instant};
 /// Maximum number of kept steps per world.
 pub const MAX_ENTRIES: usize = 4096;
 
-/// Maximum number of kept bytes of all worlds. They hold 4,096 steps of three 64 x 64 worlds with hidden states and
+/// Maximum size of all kept steps, in bytes: enough for 4,096 steps of three 64 x 64 worlds with hidden states and
 /// beliefs, or 800 steps of a 256 x 256 world.
 const MAX_BYTES: usize = 256 << 20;
 
 /// Number of latest steps that can still receive hidden states and beliefs.
 const MAX_DELAY: usize = 512;
 
-/// Maximum age of a belief that is shown with a later step.
+/// Maximum age at which a belief is still shown with a later step.
 const MAX_BELIEF_AGE: Duration = Duration::from_secs(5);
 
 /// Maximum number of hidden states held for frames that have not arrived. Channels are read one after the other, and a
@@ -40,7 +40,7 @@ pub struct Album {
 pub struct Strip {
     entries: VecDeque<Entry>,
     first_serial: u64,
-    /// First robot of the agent whose beliefs are shown, and the arrival time of its last believed step.
+    /// First robot of the agent whose beliefs are shown, and the arrival time of the last step with its belief.
     believer: Option<(u32, Instant)>,
 }
 
@@ -112,8 +112,8 @@ impl Album {
         }
     }
 
-    /// Adds an agent's belief to its step. Returns `false` if the step has not arrived, or is no longer kept. `states`
-    /// are the model's states.
+    /// Adds an agent's belief to the step that it is about. Returns `false` if that step has not arrived, or is no
+    /// longer kept. `states` are the model's states.
     pub fn add_belief(&mut self, published: &AgentBelief, states: Option<&States>) -> bool {
         let AgentHeader {
             seed,
@@ -134,9 +134,9 @@ impl Album {
         };
         let (_, height, width) = published.belief.dim();
         if (height, width) != entry.shape.dim() {
-            return true; // It has another grid, so it can never be shown.
+            return true; // The belief is on another grid, so it can never be shown.
         }
-        // Of several agents on a world, the page shows the one with the lowest robot, while it publishes beliefs.
+        // Of several agents on a world, the page shows the one with the lowest robot, as long as it publishes beliefs.
         let has_priority = |(first, at): (u32, Instant)| {
             first < first_robot && entry.at.duration_since(at) < MAX_BELIEF_AGE
         };
@@ -190,8 +190,8 @@ impl Strip {
         self.entries.iter().take(n).rev()
     }
 
-    /// Returns the steps of one run up to a serial number, latest first. Older steps may belong to another server, or
-    /// may precede a restore.
+    /// Returns the steps of the last run up to a serial number, latest first. A new episode, a new server or a restore
+    /// starts a new run.
     pub fn run_up_to(&self, serial: u64) -> impl Iterator<Item = &Entry> {
         let mut next: Option<&Entry> = None;
         self.back_from(serial)
@@ -211,7 +211,7 @@ impl Strip {
         self.entries.iter()
     }
 
-    /// Returns one of the latest steps, and the agent whose beliefs are shown.
+    /// Returns the step with this key if it is among the latest, and the agent whose beliefs are shown.
     fn entry(&mut self, key: Key) -> Option<(&mut Entry, &mut Option<(u32, Instant)>)> {
         let mut latest = self.entries.iter_mut().rev().take(MAX_DELAY);
         let entry = latest.find(|entry| entry.key() == key)?;

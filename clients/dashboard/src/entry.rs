@@ -15,7 +15,7 @@ pub struct Entry {
     pub shape: Shape,
     pub result: WorldResult,
     pub robots: Vec<Robot>,
-    /// Cells that any robot saw, row by row, with the observed values.
+    /// Cells that at least one robot saw, row by row, with the observed values.
     pub seen: Vec<(u32, u8)>,
     /// Hidden states, row by row, if they are published.
     pub truth: Option<Box<[u8]>>,
@@ -45,20 +45,20 @@ pub struct Belief {
     /// Number of the first robot that the agent flies.
     pub first_robot: u32,
     pub n_robots: u32,
-    /// How well it matches the hidden states, if these are known.
+    /// Scores of the belief against the hidden states, if these are known.
     pub score: Option<Score>,
 }
 
 /// Scores of a belief against the hidden states.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Score {
-    /// Mean over cells of minus the logarithm of the true state's probability, in nats.
+    /// Negative log probability of the true state, in nats, averaged over cells.
     pub log_loss: f64,
-    /// Mean over cells of the squared error of the target state's probability.
+    /// Squared error of the target state's probability, averaged over cells.
     pub brier: f64,
 }
 
-/// The names of the model's states, and the index of the state that pays most.
+/// The names of the model's states, and the index of the state with the highest reward.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct States {
     pub names: Vec<String>,
@@ -106,7 +106,7 @@ impl Entry {
         })
     }
 
-    /// Returns whether any robot flew: no robot flies in a reset or a restore.
+    /// Returns whether any robot flew. In a reset or a restore, no robot flies.
     pub fn is_step(&self) -> bool {
         self.robots.iter().any(|robot| !robot.moves.is_empty())
     }
@@ -125,7 +125,7 @@ impl Entry {
         of(self) == of(other) && self.result.step < other.result.step
     }
 
-    /// Returns whether `next` repeats this entry, as servers repeat the last frame for a new observer.
+    /// Returns whether `next` repeats this entry. Servers repeat the last frame for a new observer.
     pub(crate) fn repeats(&self, next: &Self) -> bool {
         self.result == next.result && self.robots == next.robots
     }

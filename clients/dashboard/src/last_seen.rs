@@ -6,16 +6,16 @@ use emberwatch_protocol::frame::UNOBSERVED;
 
 /// The latest observation of each cell, as of some step.
 pub(crate) struct LastSeen {
-    /// The observation, [`UNOBSERVED`] if there was none.
+    /// The latest observation of each cell, [`UNOBSERVED`] if there was none.
     pub(crate) seen: Vec<u8>,
-    /// Its age in steps, at most 255.
+    /// The age of each observation in steps, at most 255.
     pub(crate) age: Vec<u8>,
     /// The first step that was searched; 0 if older steps can add nothing.
     pub(crate) since: u64,
 }
 
 impl LastSeen {
-    /// Collects the observations of one run, up to the entry `last` with this serial number.
+    /// Collects the observations of the run that ends at the entry `last`, which has this serial number.
     pub(crate) fn of(strip: &Strip, serial: u64, last: &Entry) -> Self {
         let n_cells = last.shape.n_cells();
         let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);

@@ -22,7 +22,7 @@ const TICK: Duration = Duration::from_millis(50);
 /// Niceness, of at most 19: on a busy machine, a simulator that wakes up runs first.
 const NICENESS: i32 = 5;
 
-/// The expectation in errors about `--listen`.
+/// The expectation that errors about `--listen` report.
 const LISTEN: &str = "expected an address of this machine and a free port; port 0 selects one";
 
 /// Shows an Emberwatch instance, or a recording, in a browser. Only reads, never acts.
@@ -82,7 +82,7 @@ fn run(cli: &Cli) -> Result<()> {
             () = end(&stop, exit_with.as_ref()) => Ok(()),
         }
     });
-    // Ports are closed by the threads that opened them.
+    // The threads that opened the ports must also close them.
     stop.store(true, Ordering::Relaxed);
     let ended = threads.into_iter().map(JoinHandle::join);
     let n_panics = ended.filter(Result::is_err).count();

@@ -48,9 +48,9 @@ pub const ASSETS: [Asset; 23] = assets![
 mod tests {
     use super::*;
 
-    /// A proxy may serve the page below a path, where `/main.js` belongs to another page.
+    /// A proxy may serve the page below a path. `/main.js` would then belong to another page.
     #[test]
-    fn files_name_each_other_relative_to_the_page() {
+    fn references_between_files_are_relative() {
         for Asset { path, text, .. } in ASSETS {
             for absolute in ["=\"/", "from \"/", "import(\"/", "url(/", "location.host"] {
                 assert!(!text.contains(absolute), "{path}: {absolute}");

@@ -1,4 +1,4 @@
-//! One picture for a browser: the browser's request, and the answer. Does no I/O.
+//! A browser's request for a picture, and the picture that answers it. Does no I/O.
 //!
 //! A picture is a `u32` length, JSON of this length in bytes (a `Header`), and the arrays that the JSON lists. The JSON
 //! is padded with spaces and each array with zeros, so that all arrays begin at multiples of eight bytes. Numbers are
@@ -20,10 +20,10 @@ const BINS: (usize, usize) = (16, 2000);
 /// The number that stands for no objective.
 const NO_OBJECTIVE: u8 = 255;
 
-/// Maximum number of distinct objectives; further objectives count as the last one.
+/// Maximum number of distinct objectives. Further objectives are shown as the last one.
 const MAX_OBJECTIVES: usize = 255;
 
-/// Maximum delay of a step with a belief that is shown instead of a newer step without one.
+/// Maximum age difference for which a step with a belief is shown instead of a newer step without a belief.
 const BELIEF_LAG: Duration = Duration::from_millis(200);
 
 /// Time without a new belief after which an agent counts as silent.
@@ -41,7 +41,7 @@ pub struct Ask {
     /// A recording's new speed, as [`Player::speed`].
     #[serde(default)]
     pub speed: Option<f64>,
-    /// Whether a recording is to play.
+    /// Whether the recording should play.
     #[serde(default)]
     pub playing: Option<bool>,
 }
@@ -78,7 +78,7 @@ struct Shown {
     height: usize,
     width: usize,
     seen_since: u64,
-    /// As text, because browsers keep only 53 bits of a number.
+    /// Text, because JavaScript represents only integers up to 53 bits exactly.
     seed: String,
     episode: u64,
     step: u64,
@@ -106,7 +106,7 @@ struct ShownRobot {
 #[derive(Debug, Serialize)]
 struct AgentFacts<'a> {
     pid: u32,
-    /// The first robot that it flies, numbered within the world.
+    /// The first robot that the agent flies, numbered within the world.
     first_robot: u32,
     n_robots: u32,
     policy: &'a str,
@@ -114,7 +114,7 @@ struct AgentFacts<'a> {
     objective: &'a str,
     plan_millis: f64,
     states: &'a [String],
-    /// The step that the belief is about, which is not after the shown step.
+    /// The step that the belief is about: the shown step or an earlier one.
     step: u64,
     is_live: bool,
 }
@@ -143,7 +143,7 @@ struct Arrays {
     bytes: Vec<u8>,
 }
 
-/// Builds the picture that a browser requested. By `now`, an agent without a recent belief counts as silent.
+/// Builds the picture that a browser requested. An agent whose last belief is not recent at `now` counts as silent.
 pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
     let strip = scene.album.strip(ask.world);
     let chosen = strip.and_then(|strip| match ask.at {
@@ -188,7 +188,8 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
     [framed(&header), arrays.bytes].concat()
 }
 
-/// Returns the newest step, or the newest step with a belief if it is hardly older.
+/// Returns the newest step with a belief if it is at most [`BELIEF_LAG`] older than the newest step, which it otherwise
+/// returns.
 fn newest(strip: &Strip) -> Option<(u64, &Entry)> {
     let (_, last) = strip.kept()?;
     let newest = strip.nearest(last)?;
@@ -259,8 +260,8 @@ impl Arrays {
         }
     }
 
-    /// Adds time series over all kept steps, divided into `n_bins` bins. Each bin has the mean of its steps, and the
-    /// last objective. Returns the names of the objectives.
+    /// Adds time series over all kept steps, divided into `n_bins` bins. Each bin contains means over its steps, and
+    /// its last objective. Returns the names of the objectives.
     fn add_series<'a>(
         &mut self,
         strip: &'a Strip,
@@ -298,7 +299,7 @@ impl Arrays {
     }
 }
 
-/// Returns an objective's number among the objectives so far, which grow if it is new.
+/// Returns an objective's index in `objectives`. Appends the objective if it is new.
 fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     let known = objectives.iter().position(|known| *known == objective);
     let number = known.unwrap_or_else(|| {
@@ -310,7 +311,7 @@ fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     number as u8
 }
 
-/// Returns the airspace of an entry: the server's, or an open one if that is unknown or of another grid.
+/// Returns the server's airspace. If it is unknown or belongs to another grid, returns one without no-fly cells.
 fn airspace(info: Option<&Info>, entry: &Entry) -> Airspace {
     let known = info.and_then(|info| info.airspace.clone());
     let known = known.filter(|airspace| airspace.shape() == entry.shape);

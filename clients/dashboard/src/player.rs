@@ -17,7 +17,7 @@ const TICK: Duration = Duration::from_millis(20);
 /// Starts a thread that plays a recording until `stop`. Returns the thread.
 ///
 /// # Errors
-/// If the file cannot be opened, or is not a recording. The page shows problems that occur later.
+/// If the file cannot be opened or is not a recording. Later problems are shown on the page.
 pub fn play(path: &Path, stage: &Arc<Stage>, stop: &Arc<AtomicBool>) -> Result<JoinHandle<()>> {
     let mut reader = Some(open(path)?);
     let player = Player {
@@ -85,7 +85,7 @@ fn change_player(stage: &Stage, act: impl FnOnce(&mut Player)) {
 struct Playing<'a> {
     stage: &'a Stage,
     stop: &'a AtomicBool,
-    /// Recorded time that has been played.
+    /// Position in the recording: the recorded time that has been played.
     clock: Duration,
     /// When the clock was last updated.
     looked: Instant,

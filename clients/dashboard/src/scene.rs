@@ -1,4 +1,4 @@
-//! Everything that the page can show, shared by the threads that fill it and the server that answers browsers.
+//! Everything that the page can show. Some threads fill it, and the web server reads it to answer browsers.
 
 use crate::album::Album;
 use crate::entry::States;
@@ -15,11 +15,11 @@ pub struct Scene {
     pub album: Album,
     /// The instance's name, or the recording's file.
     pub instance: String,
-    /// Whether a server answers; always for a recording.
+    /// Whether a server answers. Always true for a recording.
     pub is_serving: bool,
-    /// Why the server cannot be asked, in one sentence for people.
+    /// Why the server's status cannot be requested, in one sentence for people.
     pub note: Option<String>,
-    /// Why some of its channels cannot be read.
+    /// Why some of the server's channels cannot be read.
     pub trouble: Option<String>,
     /// The server's description of itself.
     pub info: Option<Info>,
@@ -50,7 +50,7 @@ pub struct Player {
     pub playing: bool,
     /// Whether the end was reached. Playing then starts from the beginning.
     pub ended: bool,
-    /// Why it ended early.
+    /// Why playback ended early.
     pub error: Option<String>,
 }
 
@@ -69,7 +69,7 @@ pub struct Info {
     target_state: Option<usize>,
     observations: Vec<String>,
     observation_colours: Option<Vec<String>>,
-    /// Number of observations on the path. The observations of each outer ring follow, in the same colours.
+    /// Number of observation values on the path. The values of each outer ring follow, and have the same colours.
     n_named: usize,
     /// Rows and columns that robots see beyond their path.
     radius: usize,
@@ -95,7 +95,7 @@ pub struct Stage {
 }
 
 impl Scene {
-    /// Returns an empty scene of this name.
+    /// Returns an empty scene with this name.
     pub fn new(instance: &str) -> Self {
         Self {
             album: Album::default(),
@@ -121,8 +121,8 @@ impl Scene {
 }
 
 impl Info {
-    /// Reads a server's description, with its model or its description of recorded worlds if it reveals one. Treats an
-    /// invalid one as hidden.
+    /// Reads a server's description. If the server reveals its model or a description of its recorded worlds, also
+    /// reads that. Treats an invalid model or description as hidden.
     pub fn new(info: &ServerInfo) -> Self {
         let recorded = info.recorded_world.as_ref();
         let description = recorded.and_then(|recorded| recorded.description.as_deref());
@@ -179,11 +179,11 @@ impl Stage {
 
     /// Reads the scene.
     pub fn look(&self) -> MutexGuard<'_, Scene> {
-        // A panic during a change can only have left wrong counts or pictures, on which nothing relies.
+        // A panic during a change can at worst leave wrong counts or pictures, and nothing relies on these.
         self.scene.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes the scene, and notifies all who wait for changes.
+    /// Changes the scene, and notifies all receivers of [`Self::changes`].
     pub fn change<T>(&self, act: impl FnOnce(&mut Scene) -> T) -> T {
         let done = act(&mut self.look());
         self.changes.send_modify(|n| *n += 1);

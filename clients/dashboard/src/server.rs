@@ -24,7 +24,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
-/// Minimum time between two pictures: thirty per second.
+/// Minimum time between two pictures, which allows thirty per second.
 const PICTURE_INTERVAL: Duration = Duration::from_millis(33);
 
 /// Time after which a picture is sent even if nothing has changed.
@@ -61,7 +61,7 @@ struct Service {
 /// this server.
 ///
 /// # Errors
-/// If the system reports an error of the listener.
+/// If the operating system reports an error of the listener.
 pub async fn serve(
     listener: TcpListener,
     stage: Arc<Stage>,
@@ -92,7 +92,7 @@ pub async fn serve(
     axum::serve(listener, router).await
 }
 
-/// Refuses requests that come from pages of other sites.
+/// Refuses requests from pages of other sites.
 async fn only_own_pages(State(service): State<Service>, request: Request, next: Next) -> Response {
     match access::check(request.headers(), &service.names) {
         Ok(()) => next.run(request).await,
@@ -142,7 +142,7 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
         let wanted = Some((ask.world, ask.at));
         if before == wanted {
             tokio::select! {
-                // A change since the last picture ends the wait, and so does the next request.
+                // A change since the last picture ends the wait. So does the next request.
                 _ = timeout(PATIENCE, changes.changed()) => {}
                 message = socket.recv() => match message {
                     Some(Ok(message)) => early = Some(message),
@@ -160,7 +160,7 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
     }
 }
 
-/// Returns the next message, which may have arrived during the last answer. Returns `None` if the browser has gone, or
+/// Returns the next message, which may have arrived during the last answer. Returns `None` if the browser is gone, or
 /// does not answer pings.
 async fn next_message(socket: &mut WebSocket, early: &mut Option<Message>) -> Option<Message> {
     if let Some(message) = early.take() {
@@ -180,7 +180,7 @@ async fn send(socket: &mut WebSocket, message: Message) -> Option<()> {
     timeout(SILENCE, socket.send(message)).await.ok()?.ok()
 }
 
-/// Passes a browser's request on to the recording's player.
+/// Passes the speed and playback wishes of a browser's request on to the recording's player.
 fn order(stage: &Stage, ask: &Ask) {
     if ask.speed.is_none() && ask.playing.is_none() {
         return;

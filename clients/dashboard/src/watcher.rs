@@ -1,6 +1,6 @@
-//! Watches a running instance: before its server starts, while it runs, after it ended.
+//! Watches an instance: before its server starts, while the server runs, and after it has ended.
 //!
-//! One thread reads the published samples, which needs no server. Another thread regularly asks the server for its
+//! One thread reads the published samples, even if no server runs. Another thread regularly asks the server for its
 //! status.
 
 use crate::scene::{Info, Stage};
@@ -17,13 +17,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Minimum time between two reads of the channels: a buffer of 64 frames lasts that long at 32,000 steps per second.
+/// Minimum time between two reads of the channels. A buffer of 64 frames lasts that long at 32,000 steps per second.
 const MIN_INTERVAL: Duration = Duration::from_millis(2);
 
-/// Maximum time between two reads: each read costs processor time that the simulator may need.
+/// Maximum time between two reads. Longer intervals cost the simulator less processor time.
 const MAX_INTERVAL: Duration = Duration::from_millis(10);
 
-/// Numbers of frames and beliefs in one read above which buffers may overflow, so that the next read is due soon.
+/// Numbers of frames and beliefs in one read above which the next read follows soon, before buffers overflow.
 const MANY: (usize, usize) = (FRAME_BUFFER / 3, AGENT_BUFFER / 3);
 
 /// How long to read at the minimum interval after a large read.
@@ -35,7 +35,7 @@ const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
 /// How long a belief waits for its frame: an agent's belief may arrive before the server's frame.
 const EARLY: Duration = Duration::from_secs(1);
 
-/// Maximum number of samples per channel in one read, so that browsers get their turn.
+/// Maximum number of samples per channel in one read, so that browsers need not wait long.
 const MAX_AT_ONCE: usize = 128;
 
 /// Time between two status requests, and between two attempts to find a server.
@@ -59,7 +59,7 @@ pub fn watch(
     let (ready, is_ready) = std::sync::mpsc::channel();
     let spawn = |name: &str| std::thread::Builder::new().name(name.into());
     let (place, on, until) = (instance.clone(), stage.clone(), stop.clone());
-    // Ports stay on the thread that made them.
+    // Ports must stay on the thread that created them.
     let reader = spawn("reader").spawn(move || {
         let opened = Reader::open(&place, &on);
         let _ = ready.send(opened.as_ref().err().map(ToString::to_string));
@@ -156,8 +156,8 @@ impl Gaps {
 }
 
 impl Reader {
-    /// Opens the channels. If the channel of hidden states or beliefs cannot be opened, reports that and reads the
-    /// others.
+    /// Opens the channels. If the channel of hidden states or of beliefs cannot be opened, reports that and reads the
+    /// remaining channels.
     fn open(instance: &Instance, stage: &Stage) -> Result<Self, ChannelError> {
         let frames = Observer::frames(instance)?;
         let (truth, agents) = (Observer::truth(instance), Observer::agents(instance));
@@ -197,10 +197,10 @@ impl Reader {
         Ok(())
     }
 
-    /// Reads the available samples. Returns whether there were many.
+    /// Reads the available samples. Returns true if there were many.
     fn look(&mut self, stage: &Stage) -> Result<bool, ChannelError> {
-        // Beliefs are read first: their frames are published at about the same time, so they usually have arrived by
-        // then.
+        // Beliefs are read first. Their frames are published at about the same time, so by the time frames are read,
+        // these have usually arrived.
         let beliefs = self.agents.as_ref().map_or(Ok(Vec::new()), all)?;
         let frames = all(&self.frames)?;
         let truths = self.truth.as_ref().map_or(Ok(Vec::new()), all)?;

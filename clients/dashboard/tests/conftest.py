@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, BrowserContext, sync_playwright
 from looking import Look
 from running import PATIENCE, Dashboard, Program, Programs
 
-#: Deadline of a whole test, in seconds; long, because a busy machine is not a bug.
+#: Deadline of a whole test, in seconds. It is long, because a busy machine is not a bug.
 DEADLINE = 900
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -45,7 +45,7 @@ def chromium(request: pytest.FixtureRequest) -> Iterator[Browser]:
     path = request.config.getoption("--chromium")
     if path is None:
         pytest.fail("expected `chromium` on the PATH (apt-get install chromium), or --chromium")
-    # A root user's browser, as in containers, has no sandbox.
+    # Chromium cannot use its sandbox as root, for example in containers.
     flags = ["--no-sandbox"] if os.geteuid() == 0 else []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=flags, timeout=120_000)
@@ -55,7 +55,7 @@ def chromium(request: pytest.FixtureRequest) -> Iterator[Browser]:
 
 @pytest.fixture
 def programs(request: pytest.FixtureRequest) -> Iterator[Programs]:
-    """Starts programs, such as `programs.server(worlds=4)`, which all end with the test."""
+    """Starts programs, for example with `programs.server(worlds=4)`. All end with the test."""
     with ExitStack() as stack:
         yield Programs(request.config.getoption("--programs"), stack)
 
@@ -64,7 +64,7 @@ def programs(request: pytest.FixtureRequest) -> Iterator[Programs]:
 def open_page(request: pytest.FixtureRequest, chromium: Browser) -> Iterator[Callable[..., Look]]:
     """Opens a dashboard's page: `open_page(dashboard, hash="#world=2", color_scheme="dark")`.
 
-    At the end of the test, the page must have no complaints except those that the test allowed.
+    At the end of the test, the page must have no complaints that the test has not allowed.
     """
     throttle = request.config.getoption("--throttle")
     looks: list[Look] = []
@@ -88,7 +88,7 @@ def open_page(request: pytest.FixtureRequest, chromium: Browser) -> Iterator[Cal
 
 
 class Watched(NamedTuple):
-    """A server that publishes its hidden states, an agent, and a page that shows its belief."""
+    """A server that publishes hidden states, an agent, and a page that shows the agent's belief."""
 
     server: Program
     dashboard: Dashboard

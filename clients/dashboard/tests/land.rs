@@ -1,4 +1,4 @@
-//! The data that pages receive about zones, no-fly cells and sensors.
+//! Tests of the data that pages receive about zones, no-fly cells and sensors.
 
 use crate::server_info;
 use emberwatch_dashboard::scene::Info;

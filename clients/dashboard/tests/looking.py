@@ -1,4 +1,4 @@
-"""Reads what a browser shows: texts, pixels, and the picture that they were drawn from."""
+"""Reads what a browser shows: texts, pixels, and the picture from which they were drawn."""
 
 import base64
 import re
@@ -10,7 +10,7 @@ from playwright.sync_api import Locator, Page, WebSocketRoute
 
 from running import eventually
 
-#: Returns the bytes of an expression's typed array or canvas as base64.
+#: Returns the bytes of a typed array as base64.
 _BYTES = """bytes => {
   let text = "";
   for (let i = 0; i < bytes.length; i += 8192) {
@@ -19,8 +19,9 @@ _BYTES = """bytes => {
   return btoa(text);
 }"""
 
-#: The browser reports all data of a page to the harness, without waiting for it. On a busy machine
-#: the harness would fall behind for minutes, so pages request at most 2 MB per second.
+#: The browser reports all data that a page receives to the harness, without waiting for the
+#: harness. On a busy machine the harness would fall behind by minutes, so pages request at most
+#: 2 MB per second.
 _PACE = """(() => {
   const BYTES_A_MILLI = 2000;
   window.WebSocket = class extends WebSocket {
@@ -41,12 +42,12 @@ _PACE = """(() => {
 
 
 class Look:
-    """A page under test. `allowed` are patterns of complaints that the test provokes."""
+    """A page under test. `allowed` lists patterns of complaints that the test provokes."""
 
     def __init__(self, page: Page) -> None:
         """Starts recording the page's errors and warnings."""
         self.page = page
-        # Only tests read pixels back, about whose slowness the browser warns.
+        # The browser warns that reading pixels back is slow, but only tests do so.
         self.allowed = ["willReadFrequently"]
         self._complaints: list[str] = []
         page.add_init_script(_PACE)
@@ -69,7 +70,7 @@ class Look:
         return sum(bool(re.search(pattern, complaint)) for complaint in self._complaints)
 
     def alter(self, change: Callable[[bytes], bytes]) -> None:
-        """Reloads the page, and changes the dashboard's messages on the way."""
+        """Reloads the page. From then on, changes the dashboard's messages before they arrive."""
 
         def route(socket: WebSocketRoute) -> None:
             dashboard = socket.connect_to_server()
@@ -89,7 +90,7 @@ class Look:
         return self.at(testid).text_content().strip()
 
     def number(self, testid: str) -> float:
-        """Returns an element's text as a number; NaN while it is not one."""
+        """Returns an element's text as a number, or NaN while the text is not a number."""
         text = self.text(testid).replace(",", "")
         return float(text) if re.fullmatch(r"-?[0-9.]+", text) else float("nan")
 
@@ -134,8 +135,8 @@ class Look:
         self.eventually(lambda: self.drawn() >= first + count, f"{count} more pictures")
 
     def wait_for_steps(self, count: int = 3) -> None:
-        """Waits until the page has shown further steps. Agents may begin at the first step
-        again."""
+        """Waits until the page has shown `count` more steps. Agents may start a new episode
+        meanwhile."""
         first = float("inf")
 
         def are_shown() -> bool:

@@ -1,4 +1,4 @@
-//! All tests as one program, because each further program would link the crate again.
+//! All tests in one program, because each further program would link the crate again.
 
 use emberwatch_protocol::control::ServerInfo;
 use serde_json::{Value, json};
@@ -7,7 +7,7 @@ mod land;
 mod pictures;
 mod player;
 
-/// Returns the description of a server of a 2 x 3 world, with some keys changed.
+/// Returns the description of a server with a 2 x 3 world. `keys` replace keys of the description.
 fn server_info(keys: Value) -> ServerInfo {
     let mut info = json!({
         "protocol": 2, "build": "0.1.0", "pid": 1, "height": 2, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 1,

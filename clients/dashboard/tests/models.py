@@ -9,7 +9,7 @@ def model_file(
 ) -> str:
     """Returns a model file. States have an initial probability, a reward, and observation weights.
 
-    The kernel between two states is `weights` times their scale.
+    The kernel between two states is `weights` times the pair's scale.
     """
     lines = ['name = "made"', f"kernel_size = {[len(weights), len(weights[0])]}"]
     for number, (name, (initial, reward, observed_as)) in enumerate(states.items()):

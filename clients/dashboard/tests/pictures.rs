@@ -1,4 +1,4 @@
-//! The pictures that browsers receive, built from published samples.
+//! Tests of the pictures that browsers receive, built from published samples.
 
 use emberwatch_dashboard::album::{Album, MAX_ENTRIES};
 use emberwatch_dashboard::entry::States;
@@ -24,7 +24,7 @@ fn frame(step: u64, values: [u8; 6]) -> Sample<FrameHeader> {
     frame_of(step, &[(robot, values)])
 }
 
-/// Returns a frame of several robots, whose moves all go right.
+/// Returns a frame of several robots, which all fly right.
 fn frame_of(step: u64, robots: &[(RobotResult, [u8; 6])]) -> Sample<FrameHeader> {
     let header = FrameHeader {
         n_robots: robots.len() as u32,
@@ -239,7 +239,7 @@ fn what_was_seen_is_remembered_with_its_age_and_how_far_it_reaches() {
             [NO, 0, 3, NO, NO, NO],
             0, // since the beginning of the episode
         ),
-        // An episode that begins again, or an episode of another server, starts without observations.
+        // An episode that begins anew, or an episode of another server, starts without observations.
         (
             vec![(5, [NO, 0, 1, NO, NO, NO]), (1, [NO; 6])],
             [NO; 6],

@@ -1,4 +1,4 @@
-//! A damaged recording is played up to the damage, which is reported.
+//! Test that a damaged recording is played up to the damage, and that the damage is reported.
 
 use crate::server_info;
 use emberwatch_dashboard::player::play;
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Returns a recording of three steps of a 2 x 3 world, the last one damaged.
+/// Returns a recording of three steps of a 2 x 3 world. The last step is damaged.
 fn damaged() -> Vec<u8> {
     let info = server_info(json!({}));
     let frame = |step| {

@@ -1,4 +1,4 @@
-"""The real programs as child processes, each test on its own instance."""
+"""Runs the real programs as child processes. Each test has its own instance."""
 
 import itertools
 import os
@@ -10,10 +10,10 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-#: Maximum time, in seconds, of operations that should take much less.
+#: Time limit, in seconds, for operations that should take much less.
 PATIENCE = 180.0
 
-#: More steps per second than an agent can make.
+#: A limit of steps per second that no agent reaches.
 FAST = 1_000_000
 
 _numbers = itertools.count()
@@ -60,7 +60,7 @@ class Program:
         return self._process.wait(PATIENCE)
 
     def kill(self) -> None:
-        """Kills the program, which no handler can prevent, and waits until it has ended."""
+        """Kills the program with a signal that it cannot handle, and waits until it has ended."""
         self._process.kill()
         self._process.wait(PATIENCE)
         self._process.stdout.close()
@@ -97,9 +97,9 @@ class Programs:
         return subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode == 0
 
     def agent(self, instance: str, **settings: object) -> Program:
-        """Starts an agent that acts on a world for some `steps`, or until it is stopped.
+        """Starts an agent that acts on a world for `steps` steps, or until it is stopped.
 
-        The agent leaves the processor to the browser: its plans are cheap, and its steps are slow.
+        The agent leaves processor time to the browser: its plans are cheap, and its steps are slow.
         """
         eventually(lambda: self.is_serving(instance), "a server")
         pace = {} if "steps" in settings else {"steps_per_second": 10}
@@ -125,7 +125,7 @@ class Programs:
         port: int = 0,
         name: str | None = None,
     ):
-        """Starts a dashboard for an instance or a recording. `name` is a further host name."""
+        """Starts a dashboard for an instance or a recording. `name` is an additional host name."""
         source = {"recording": recording} if recording else {"instance": instance}
         arguments = flags(source | {"exit_with": os.getpid(), "name": name})
         return self._keep(Dashboard(self._path("dashboard"), arguments, port))

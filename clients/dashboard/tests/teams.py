@@ -1,4 +1,4 @@
-"""Recordings of a team, written byte by byte so that tests choose what the robots do."""
+"""Writes recordings of a team byte by byte, so that tests choose what the robots do."""
 
 import json
 import struct
@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 HEIGHT, WIDTH = 24, 32
-#: The states of robots, which repeat in this order.
+#: The states of robots. Robot n has state n modulo 3.
 STATES = ("flew", "hovered", "late")
 
-#: A path eight cells right and four down, and back.
+#: A path that goes eight cells right and four down, and the path back.
 THERE, BACK = [3] * 8 + [1] * 4, [0] * 4 + [2] * 8
 
 #: The header of a record, without its checksum (PROTOCOL.md).
@@ -22,9 +22,9 @@ _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
 
 
 def write_recording(file: Path, n_robots: int, n_steps: int, nanos: int = 0) -> None:
-    """Writes steps of robots that begin seven rows and ten columns apart, modulo the grid.
+    """Writes steps of robots that start seven rows and ten columns apart, modulo the grid size.
 
-    All frames have the time `nanos`, in nanoseconds after the server's record.
+    All frames are recorded `nanos` nanoseconds after the server's record.
     """
     cells = np.array([(4 + 7 * robot, 5 + 10 * robot) for robot in range(n_robots)])
     cells %= (HEIGHT, WIDTH)
@@ -50,7 +50,7 @@ def _server(n_robots: int) -> dict[str, object]:
 
 
 def _frame(step: int, cells: np.ndarray) -> bytes:
-    """Returns the body of a frame, and moves the robots that fly."""
+    """Returns the body of a frame. Also updates the cells of the robots that fly."""
     robots = [STATES[robot % 3] for robot in range(len(cells))]
     hovered, late = (sum((state == of) << i for i, state in enumerate(robots)) for of in STATES[1:])
     results, frames, paths = b"", b"", b""

@@ -1,4 +1,4 @@
-"""Access to the page: refusal of other sites, screen readers, keys, small screens."""
+"""Tests access to the page: refusal of other sites, screen readers, keys, small screens."""
 
 import base64
 import os
@@ -96,7 +96,7 @@ def test_it_fits_and_axe_finds_nothing_serious(request, programs, open_page, the
 def test_tab_reaches_every_control_and_canvases_tell_what_they_show(watched):
     look = watched.look
     truth, chart = look.at("panel-truth"), look.at("chart-reward")
-    # Descriptions follow the drawing with a delay.
+    # Descriptions are updated some time after the drawing.
     look.eventually(
         lambda: "cells in state fire at step" in truth.get_attribute("aria-label"), "the truth"
     )

@@ -1,4 +1,4 @@
-"""Zones, no-fly cells, and cells that robots see beyond their path."""
+"""Tests zones, no-fly cells, and cells that robots see beyond their path."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ ZONE_MAP[:, WIDTH // 2 :] = 1
 
 
 def model_of_zones() -> str:
-    """Returns the wildfire on two zones of land, with a no-fly zone, and a sensor of two rings."""
+    """Returns a wildfire model with two zones, no-fly cells, and a sensor with two rings."""
     text = (ROOT / "config/models/wildfire.toml").read_text()
     head, states = text.split("[[states]]", 1)
     states, kernel = states.split("[[kernel]]", 1)
@@ -51,7 +51,7 @@ def test_land_is_drawn_and_told(programs, open_page, tmp_path):
 
 
 def check_cells(look, theme: str) -> None:
-    """Checks that rings have the path's colours, and unobserved cells their zone's muted colour."""
+    """Checks that rings have the path's colours, and unobserved cells their zone's pale colour."""
     frame = look.array("frame").reshape(HEIGHT, WIDTH)
     pixels = look.pixels("panel-frame")[..., :3].astype(float)
     assert set(frame[frame != 255]) & {3, 4, 5}, "observed from the rings"
@@ -65,7 +65,7 @@ def check_cells(look, theme: str) -> None:
 
 
 def check_lines(look) -> None:
-    """Checks hatches over no-fly cells, dots between zones, and the line around seen cells."""
+    """Checks hatches over no-fly cells, dots between zones, and the line around observed cells."""
     frame = look.array("frame").reshape(HEIGHT, WIDTH)
     for panel in ("truth", "seen", "frame", "belief-2", "entropy"):
         is_marked = look.pixels(f"overlay-{panel}")[..., 3] > 127

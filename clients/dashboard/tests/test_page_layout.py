@@ -1,4 +1,4 @@
-"""At all common window sizes, nothing is clipped and nothing covers anything else."""
+"""Tests that nothing is clipped and no elements overlap, at all common window sizes."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from teams import write_recording
 
 SIZES = [(360, 740), (768, 1024), (1024, 768), (1056, 640), (1280, 720), (1920, 1080), (2560, 1440)]
 
-# Records the place of each text on a canvas, in the canvas's pixels, since it was last cleared.
+# Records the position of each text drawn on a canvas since the last clear, in canvas pixels.
 RECORD_TEXTS = """(() => {
   const { prototype } = CanvasRenderingContext2D;
   const { clearRect, fillText } = prototype;
@@ -29,7 +29,7 @@ RECORD_TEXTS = """(() => {
   };
 })()"""
 
-# Returns the page's present problems as sentences.
+# Returns the page's current problems as sentences.
 PROBLEMS = """() => {
   const problems = [];
   const all = (selector) => [...document.querySelectorAll(selector)]
@@ -95,7 +95,7 @@ PROBLEMS = """() => {
   return problems;
 }"""
 
-# Returns the controls within the window, and those that another element covers.
+# Returns the controls within the window, and the controls that another element covers.
 CONTROLS = """() => {
   const seen = [], covered = [];
   const all = document.querySelectorAll("button, select, input[type=range], .theme label");
@@ -120,10 +120,10 @@ CONTROLS = """() => {
 
 
 def check(look, controls: set[str]) -> None:
-    """Checks for problems at each size. The page's data must not change meanwhile."""
+    """Checks for problems at each window size. The page's data must not change meanwhile."""
     for width, height in SIZES:
         look.page.set_viewport_size({"width": width, "height": height})
-        # A canvas must be redrawn before its recorded texts are up to date.
+        # The recorded texts of a canvas are out of date until it is redrawn.
         look.eventually(lambda w=width: look.page.evaluate("innerWidth") == w, "the window's size")
         look.wait_for_pictures()
         assert look.page.evaluate(PROBLEMS) == [], f"at {width} x {height}"
@@ -140,14 +140,14 @@ LIVE = {"world", "auto", "light", "dark", "pause", "scrub"}
 
 
 def begin(look) -> None:
-    """Reloads the page, and records the texts that it draws."""
+    """Reloads the page, and starts to record the texts that it draws."""
     look.page.add_init_script(RECORD_TEXTS)
     look.page.reload()
     look.eventually(lambda: look.has("frame"), "a world")
 
 
 def test_before_and_after_an_agent_acts(programs, open_page):
-    # About two thousand cells burn, a number with a separator of thousands.
+    # About two thousand cells burn, so that the number has a thousands separator.
     server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
     begin(look)
@@ -183,7 +183,7 @@ def test_with_many_states(programs, open_page, tmp_path):
 
 
 def model_of(n_states: int) -> str:
-    """Returns a model file whose states never change, and are observed exactly."""
+    """Returns a model file with states that never change and are observed exactly."""
     names = [f"state-{state}" for state in range(n_states)]
     seen = [[float(other == state) for other in range(n_states)] for state in range(n_states)]
     states = {name: (1 / n_states, float(i == 0), seen[i]) for i, name in enumerate(names)}

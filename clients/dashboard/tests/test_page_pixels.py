@@ -1,4 +1,4 @@
-"""Compares every pixel with the arrays that it shows, coloured by the test's own table."""
+"""Compares every pixel with the displayed array, coloured by a separate table of this test."""
 
 import tomllib
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from running import PATIENCE, eventually
 STEPS = 30
 UNOBSERVED = 255
 
-# Nine stops from 0 to 1, with linear interpolation.
+# The colours of each ramp at nine stops from 0 to 1. Colours between stops are interpolated.
 BELIEF = {
     "light": "f9f8e1 c6e4be 87d0ab 4cb6a6 039aa0 057a91 005c80 003e6f 0d2156",
     "dark": "161d2b 1d3450 0d4f75 046e89 038e97 23af9b 70cb95 b8e095 f8f3a3",
@@ -26,12 +26,12 @@ UNSEEN = {"light": "e2e2e2", "dark": "2b2f36"}
 
 
 def rgb(color: str) -> np.ndarray:
-    """Converts a colour, with or without #, to three numbers."""
+    """Converts a hexadecimal colour, with or without #, to three numbers."""
     return np.array(list(bytes.fromhex(color.lstrip("#"))), float)
 
 
 def ramp(stops: str, levels: np.ndarray) -> np.ndarray:
-    """Returns the colours of 0..255 on a ramp."""
+    """Returns the colours of levels from 0 to 255 on a ramp."""
     table = np.array([rgb(stop) for stop in stops.split()])
     at = levels / 255 * (len(table) - 1)
     channels = [np.interp(at, range(len(table)), table[:, channel]) for channel in range(3)]
@@ -47,7 +47,7 @@ def of_values(values: np.ndarray, colors: list[str], unseen: str) -> np.ndarray:
 
 
 def check_pixels(look, panel: str, expected: np.ndarray) -> None:
-    """Checks that a panel's pixels are these colours, up to rounding of halves."""
+    """Checks that a panel's pixels have these colours. Halves may be rounded either way."""
     pixels = look.pixels(panel).astype(float)
     assert (pixels[..., 3] == 255).all()
     assert pixels.shape[:2] == expected.shape[:2]
@@ -87,12 +87,12 @@ def test_panels_show_what_was_published(programs, open_page):
 
 
 def check_marks(look) -> None:
-    """Checks the marks of the path, its start and the robot, and that no other marks exist."""
+    """Checks the marks of the path, its start and the robot, and that there are no other marks."""
     pixels = look.pixels("overlay-frame").astype(int)
     shape = look.pixels("panel-frame").shape[:2]
     scale = np.array(pixels.shape[:2]) / shape
     is_marked = pixels[..., 3] > 0
-    # A thin line between two rows of pixels covers half of each.
+    # A thin line between two rows of pixels covers each row by half.
     is_dark = (pixels[..., 3] > 64) & (np.abs(pixels[..., :3] - 0x14) <= 4).all(-1)
     is_light = (pixels == 255).all(-1)
     path = np.array(look.picture(".shown.robots")[0]["path"])
@@ -121,7 +121,7 @@ def check_marks(look) -> None:
 def check_panels(look, theme, states, observations, unseen) -> None:
     """Checks that the panels' pixels have the colours of their arrays."""
     grid = look.pixels("panel-frame").shape[:2]
-    # The page redraws in its next frame.
+    # The page redraws in the browser's next frame.
     frame = of_values(look.array("frame").reshape(grid), observations, unseen)
     eventually(
         lambda: np.abs(look.pixels("panel-frame")[..., :3] - frame).max() < 1, f"the theme {theme}"
@@ -141,7 +141,7 @@ def check_panels(look, theme, states, observations, unseen) -> None:
 def test_ramps_are_perceptually_even(stops):
     lightness = [oklab_lightness(rgb(stop) / 255) for stop in stops.split()]
     steps = np.diff(lightness)
-    # Stops are rounded to bytes, and clamped to the screen's gamut.
+    # The stops' colours are rounded to bytes, and clamped to the screen's gamut.
     assert np.abs(steps - steps.mean()).max() < 0.1 * abs(steps.mean())
 
 

@@ -1,4 +1,4 @@
-"""The page shows what lies under a resting pointer, even as that changes."""
+"""Tests that the page shows the values under a resting pointer, even when they change."""
 
 import re
 
@@ -13,7 +13,7 @@ def is_at(look, cell: str) -> bool:
 
 
 def is_at_robot(look) -> bool:
-    """Returns whether the inspector shows the robot's cell, as nothing is pointed at."""
+    """Returns whether the inspector shows the robot's cell, because no cell is pointed at."""
     hint = look.page.get_by_label("one cell in numbers").locator("h3 .hint")
     return hint.text_content() == "robot"
 
@@ -37,7 +37,7 @@ def told(look, chart: str) -> str:
 
 @pytest.fixture
 def resting(programs, open_page):
-    """Opens a page of 24 x 32 cells before an agent acts, so that nothing changes."""
+    """Opens a page with 24 x 32 cells on which no agent acts yet, so that nothing changes."""
     server = programs.server(publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
     look.eventually(lambda: look.has("truth"), "the world before its first step")
@@ -69,13 +69,13 @@ def test_what_moves_under_the_pointer_is_told(resting):
     assert not is_at_robot(look)
     look.page.set_viewport_size({"width": 1280, "height": 720})
     look.eventually(lambda: is_at(look, "row 23, col 31"), "the last cell again")
-    # The last of keys and pointer selects the cell.
+    # Keys or pointer select the cell, whichever was used last.
     look.page.get_by_label("cells of seen so far").focus()
     look.page.keyboard.press("ArrowDown")
     look.eventually(lambda: is_at(look, "row 13, col 16"), "where the key went")
     look.page.mouse.move(*middle(look, "panel-truth", 6, 7))
     look.eventually(lambda: is_at(look, "row 6, col 7"), "where the pointer went then")
-    # After the pointer leaves, nothing is pointed at.
+    # After the pointer has left, no cell is pointed at.
     look.page.get_by_label("cells of seen so far").blur()
     look.page.mouse.move(2, 2)
     look.eventually(lambda: is_at_robot(look), "it left the panel")
@@ -86,7 +86,7 @@ def test_what_moves_under_the_pointer_is_told(resting):
         "new PointerEvent('pointerleave', { isPrimary: true }))"
     )
     look.eventually(lambda: told(look, "target") == "", "it left the window")
-    # Scrolling moves the page under the pointer.
+    # Scrolling moves the page under the resting pointer.
     look.page.set_viewport_size({"width": 800, "height": 600})
     look.wait_for_pictures()
     x, y = middle(look, "panel-truth", 3, 4)

@@ -1,4 +1,4 @@
-"""The dashboard behind nginx with TLS and below a path, configured as in the documents."""
+"""Tests the dashboard behind nginx, with TLS and below a path, as the documents configure it."""
 
 import re
 import shutil
@@ -65,7 +65,7 @@ def free_port() -> int:
 
 @pytest.fixture
 def proxy(tmp_path: Path) -> Iterator[Callable[[Dashboard], Proxy]]:
-    """Starts nginx with the documents' configuration: `proxy(dashboard)`."""
+    """Starts nginx with the configuration from the documents: `proxy(dashboard)`."""
     nginx = shutil.which("nginx", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
     if nginx is None or shutil.which("openssl") is None:
         pytest.skip("no nginx or openssl: apt-get install nginx-light openssl")

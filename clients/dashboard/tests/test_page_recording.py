@@ -1,4 +1,4 @@
-"""A recording plays, pauses, plays fast, ends, and restarts."""
+"""Tests that a recording plays, pauses, plays fast, ends, and restarts."""
 
 from teams import write_recording
 
@@ -15,7 +15,7 @@ def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
     assert look.picture(".kept.last") > look.picture(".kept.first")
     assert look.has("frame", "seen")
     scrub_at_rest(look)
-    # So slow that the recording does not end before the next press.
+    # Plays so slowly that the recording does not end before the next press.
     look.page.evaluate("document.getElementById('speed').options[0].value = '0.001'")
     look.at("speed").select_option("0.001")
     look.eventually(lambda: look.picture(".player.speed") == 0.001, "slow")

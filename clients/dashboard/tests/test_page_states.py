@@ -1,4 +1,4 @@
-"""Servers and agents that start and end, and the page's pause, scrubbing and live view."""
+"""Tests servers and agents that start and end, and the page's pause, scrubbing and live view."""
 
 import os
 
@@ -73,13 +73,13 @@ def test_keys_pause_and_scrub_from_anywhere(watched, programs):
 
 
 def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
-    # Thousands of steps per second, because paths in a small world cost almost nothing.
+    # The agent makes thousands of steps per second, because paths in a small world cost little.
     server = programs.server(height=4, width=4, moves=2, burn_in=0)
     look = open_page(programs.dashboard(server.instance))
     programs.agent(server.instance, policy="random_walk", steps_per_second=FAST)
     look.wait_for_steps()
     look.page.keyboard.press("Space")
-    # Not `settled_serial`: once the oldest entry is shown, its serial keeps changing.
+    # `settled_serial` would not return: when the oldest entry is shown, its serial keeps changing.
     at = look.picture(".shown.serial")
     look.eventually(lambda: look.picture(".kept.first") > at, "it fell out of what is kept")
     look.eventually(lambda: look.page.get_by_text("is no longer").is_visible(), "said so")
@@ -95,7 +95,7 @@ def test_an_entry_without_a_belief_has_one_of_some_steps_before(programs, open_p
         programs.agent(server.instance, steps=5)
         while beliefs.receive(PATIENCE).step < 5:
             pass
-        # Steps soon after the last belief, because a belief is shown for only some seconds.
+        # Steps soon after the last belief, because a belief is shown only for some seconds.
         lease = client.acquire(takeover=True)
         for _ in range(3):
             lease.step([0, 1])
@@ -139,7 +139,7 @@ def test_another_agent_takes_over(watched, programs):
 
 def test_a_dashboard_that_goes_is_waited_for(watched, programs):
     server, _, _, look = watched
-    # A fixed port, below those that the system assigns to any program (from 32768).
+    # A fixed port, below the range from which the system assigns ports (from 32768).
     dashboard = programs.dashboard(server.instance, port=20000 + os.getpid() % 10000)
     look.page.goto(dashboard.url)
     look.eventually(look.at("panel-frame").is_visible, "a world")

@@ -1,4 +1,4 @@
-"""Several robots in a world: each robot's state, holder and marks."""
+"""Tests several robots in a world: each robot's state, holder and marks."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def test_each_robot_is_told_and_marked(programs, open_page, tmp_path):
 
 
 def check_marks(look) -> None:
-    """Checks the marks: a disc if a robot flew, a ring if it hovered, a dashed ring if late."""
+    """Checks the marks: a disc for a robot that flew, a ring for hovered, a dashed one for late."""
     pixels = look.pixels("overlay-frame")[..., :3].astype(int)
     scale = np.array(pixels.shape[:2]) / look.pixels("panel-frame").shape[:2]
     radius = max(0.85 * scale[1], 8)
@@ -41,7 +41,7 @@ def check_marks(look) -> None:
     around = np.stack([np.sin(turns), np.cos(turns)], axis=-1)
 
     def share(robot: int, reach: float) -> float:
-        """Returns the share of its colour on a circle around a robot."""
+        """Returns the share of a circle around a robot that has the robot's colour."""
         middle = (np.array(look.picture(".shown.robots")[robot]["cell"]) + 0.5) * scale
         rows, cols = (middle + reach * radius * around).astype(int).T
         return np.mean((np.abs(pixels[rows, cols] - rgb(COLORS[robot])) < 30).all(-1))
@@ -53,7 +53,7 @@ def check_marks(look) -> None:
     assert 0.3 < share(2, 0.87) < 0.7
     path = look.picture(".shown.robots")[0]["path"]
     line = pixels[tuple(((np.array(path[3:9]) + 0.5) * scale).astype(int).T)]
-    # A line between two rows of pixels covers some of the dark edge.
+    # A line between two rows of pixels covers a part of the dark edge.
     assert (np.abs(line - rgb(COLORS[0])) < 60).all(), "its path has its colour"
 
 

@@ -1,4 +1,4 @@
-"""Rare pictures: damaged ones, and pictures that report losses."""
+"""Tests rare pictures: damaged pictures, and pictures that report losses."""
 
 import json
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def test_losses_move_nothing(watched):
     lost: dict[str, int] = {}
     first: dict[str, object] = {}
 
-    # A growing fact, such as "silent", can wrap its line, so everything but the losses is fixed.
+    # A fact that grows, such as "silent", can wrap its line, so all facts but the losses are fixed.
     def hold(words: dict) -> None:
         for name in words.keys() - {"arrays", "series"}:
             words[name] = first.setdefault(name, words[name])
@@ -69,7 +69,7 @@ def test_what_is_lost_or_not_known_is_told(watched):
             words["shown"] |= {"seen_since": 12, "log_loss": None}
         if words["agent"]:
             words["agent"]["states"] = ["this", "that", "other"]
-        # The agent soon has seen every cell, so the frame of its last path replaces `seen`.
+        # The agent has soon seen every cell, so the frame of its last path replaces `seen`.
         names = {"series_log_loss": "unscored", "seen": "all", "frame": "seen"}
         for array in words["arrays"]:
             array["name"] = names.get(array["name"], array["name"])

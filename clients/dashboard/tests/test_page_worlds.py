@@ -1,4 +1,4 @@
-"""Large, oblong and many worlds; slow browsers; unpublished data."""
+"""Tests large, oblong and many worlds, slow browsers, and unpublished data."""
 
 import re
 
@@ -81,7 +81,7 @@ def test_ten_observations_of_a_hidden_model(programs, open_page, tmp_path):
 def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
     server = programs.server(publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
-    # Numbers of unanswered requests, after each message of each connection.
+    # The number of unanswered requests on a connection, after each of its messages.
     waiting: list[int] = []
 
     def watch(socket) -> None:
@@ -131,7 +131,7 @@ def test_one_cell_is_the_same_in_all_panels(watched):
 def test_charts_tell_values_and_seek(watched):
     look, pause = watched.look, watched.look.at("pause")
     look.eventually(lambda: look.picture(".kept.last") > 20, "some steps")
-    # Entries and steps differ if a busy machine lost frames.
+    # Serial numbers of entries differ from steps if a busy machine has lost frames.
     at = re.compile(r"^at (k|entry) [\d,]+$")
     is_older = "emberwatch.picture.shown.serial < emberwatch.picture.kept.last"
     for chart in ("reward", "target", "log-loss", "objective"):

@@ -115,7 +115,7 @@ def report(what: str, measure: Callable[[], Times], peer: str) -> None:
 def main() -> None:
     """Prints all rows."""
     report("Ctrl-C ends a waiting step", interruption, "time.sleep")
-    report("a killed server ends one", death, "a pidfd")
+    report("a killed server ends a step", death, "a pidfd")
 
 
 if __name__ == "__main__":

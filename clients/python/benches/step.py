@@ -92,7 +92,7 @@ def emberwatch_row(n_envs: int, instance: str | None = None) -> Row:
 
 @contextlib.contextmanager
 def server_row() -> Iterator[Callable[[int], Row]]:
-    """Starts a server. Yields a function that makes the row of Wildfire-v0 on it."""
+    """Starts a server. Yields a function that makes the row of Wildfire-v0 on this server."""
     instance = f"step-{os.getpid()}"
     flags = [f"--instance={instance}", "--worlds=64", "--burn-in=1000"]
     server = subprocess.Popen(["emberwatch-server", *flags])

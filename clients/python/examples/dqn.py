@@ -133,7 +133,7 @@ def main() -> None:
             action = int(values.argmax())
         observation, reward, terminated, truncated, _ = env.step(action)
         next_image = picture(observation)
-        # A truncated episode is not over: its last state still has a future.
+        # Only termination ends the return: a truncated episode would have continued.
         buffer.add(image, action, float(reward), next_image, terminated)
         image = next_image
         earned, since = earned + float(reward), since + 1

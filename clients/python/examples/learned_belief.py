@@ -81,7 +81,7 @@ class Belief(nn.Module):
         nn.init.zeros_(self.layers[-1].bias)
 
     def filtered(self, images: torch.Tensor) -> torch.Tensor:
-        # A belief comes in steps of 1 / 255; half a step avoids log(0).
+        # Beliefs are rounded to multiples of 1 / 255; half a step avoids log(0).
         return images[:, : self.n_states].clamp(min=1 / 510).log().log_softmax(1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -216,7 +216,7 @@ class Training:
 
 
 class Log:
-    """A CSV file whose rows are means over the numbers added since the last row."""
+    """A CSV file whose rows are means over the values added since the last row."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -279,14 +279,14 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--suite", type=Path, help="evaluate on the task small, into this folder")
     parser.add_argument("--load", type=Path, help="saved network to start from")
     parser.add_argument("--name", default="learned_belief", help="name in the benchmark's table")
-    parser.add_argument("--seed", type=int, default=1000, help="also of the first training world")
+    parser.add_argument("--seed", type=int, default=1000, help="seed, also of the first world")
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--beam", type=positive, default=64, help="width of the beam")
     parser.add_argument("--worlds", type=positive, default=64)
     parser.add_argument("--episode", type=positive, default=400, help="paths per episode")
-    parser.add_argument("--updates", type=positive, default=2, help="per step of the worlds")
+    parser.add_argument("--updates", type=positive, default=2, help="updates per world step")
     parser.add_argument("--threads", type=positive, default=1)
     args = parser.parse_args()
     if (args.out / "log.csv").exists():

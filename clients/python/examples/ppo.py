@@ -311,7 +311,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--sampled", action="store_true", help="evaluate sampled moves")
     parser.add_argument("--load", type=Path, help="saved network to start from")
     parser.add_argument("--name", default="ppo", help="name in the benchmark's table")
-    parser.add_argument("--seed", type=int, default=1000, help="also of the first training world")
+    parser.add_argument("--seed", type=int, default=1000, help="seed, also of the first world")
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)

@@ -72,8 +72,8 @@ class NodeServer:
 
 @ray.remote(num_cpus=0)
 class Servers:
-    """The servers of all nodes, each started on request. They end with the training, even a
-    crash."""
+    """The servers of all nodes, each started on request. They end with the training, even if
+    it crashes."""
 
     def __init__(self, n_worlds: int) -> None:
         self._n_worlds = n_worlds
@@ -174,12 +174,12 @@ def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
 def main() -> None:
     """Trains on a cluster; by default, on two nodes on this machine."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--address", help="of a running cluster; default: start two nodes here")
+    parser.add_argument("--address", help="a running cluster; default: start two nodes here")
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--runners", type=int, default=4, help="at most 15 per node")
     parser.add_argument("--worlds", type=int, default=8, help="worlds per runner")
     parser.add_argument("--batch", type=int, default=4000, help="moves per iteration")
-    parser.add_argument("--own", action="store_true", help="simulate in each runner's process")
+    parser.add_argument("--own", action="store_true", help="simulate in the runners' processes")
     parser.add_argument(
         "--kill", action="store_true", help="kill a local runner and a local server"
     )

@@ -1,7 +1,7 @@
 """RLlib's PPO with several environment runners.
 
 Each runner makes its own environment, which simulates its world in the runner's process. This
-scales to many machines, which cannot share memory: give Ray a cluster, and more runners.
+scales to many machines, which cannot share memory: use a Ray cluster and more runners.
 
     python rllib_ppo.py --iterations 20 --runners 2
 """

@@ -1,4 +1,4 @@
-r"""Replaces the paper's high-level decision by Stable-Baselines3's DQN.
+r"""Replaces the paper's high-level decision with Stable-Baselines3's DQN.
 
 Belief and plans stay in Rust. The DQN sees the features of eight plans and chooses the plan to fly.
 One small network scores every plan from its features, so that all plans share the weights. The
@@ -33,7 +33,7 @@ REWARD_SCALE = 0.1
 
 
 class Scores(nn.Module):
-    """Scores each plan by the same network over its features."""
+    """Scores each plan from its features, with the same network for all plans."""
 
     def __init__(self, n_plans: int, n_features: int, width: int = 64) -> None:
         super().__init__()
@@ -114,7 +114,7 @@ def compare(envs: VecEnv, model: DQN, n_steps: int) -> None:
 
 
 def learner(envs: VecEnv, seed: int) -> DQN:
-    """Returns a DQN with falling learning rate and exploration, and one update per 8 decisions."""
+    """Returns a DQN with decaying learning rate and exploration, and one update per 8 decisions."""
     updates = max(1, envs.num_envs // 8)
     return DQN(
         ScoringPolicy,
@@ -138,7 +138,7 @@ def learner(envs: VecEnv, seed: int) -> DQN:
 def main() -> None:
     """Trains a DQN, then compares it with simple choices on test worlds."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--checkpoint", help="of a learned filter; default: the known model")
+    parser.add_argument("--checkpoint", help="a learned filter's; default: the known model")
     parser.add_argument("--model", default="wildfire-latent")
     parser.add_argument("--moves", type=int, default=12)
     parser.add_argument("--burn-in", type=int, default=6_000)

@@ -32,8 +32,8 @@ impl Given<'_> {
         Ok(Airspace::new(shape, no_fly, self.radius, 1, self.pays()))
     }
 
-    /// Describes worlds whose model is hidden, from the number of their observation values alone. Treats each value as
-    /// a state that the sensor shows exactly.
+    /// Describes worlds with a hidden model, of which only the number of observation values is known. Treats each value
+    /// as a state that the sensor shows exactly.
     pub fn seen(&self, n_observations: usize) -> Description {
         let n_values = n_observations / self.n_rings.max(1);
         let shown = |value: usize| {

@@ -1,4 +1,4 @@
-//! The answer to a step: results of the worlds, results of the robots, frames.
+//! The answer to a step: the results of worlds and robots, and the frames.
 
 use crate::refusal::invalid;
 use crate::samples::{Robot, WorldRow, of_robot, of_world};
@@ -16,7 +16,7 @@ use pyo3::prelude::*;
 use pyo3::types::PySlice;
 use std::ops::Range;
 
-/// Bytes of a world's result and of its robot's result.
+/// Total size of one world's result and one robot's result, in bytes.
 pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
 /// Maximum number of robots in an answer: all robots of the largest server, with the largest teams.
@@ -135,7 +135,7 @@ impl Answer {
         self.slice(py, self.n_worlds() * WORLD_BYTES..self.head())
     }
 
-    /// For each robot, its world's result and then its own, as bytes; a new array.
+    /// For each robot, the bytes of its world's result followed by those of its own result. A new array.
     #[getter]
     fn results<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
         let payload = self.bytes(py)?;
@@ -217,7 +217,7 @@ impl Answer {
         self.n_worlds() * WORLD_BYTES
     }
 
-    /// Returns the number of bytes before the frames.
+    /// Returns the number of bytes that precede the frames.
     fn head(&self) -> usize {
         self.worlds_end() + self.n_robots as usize * ROBOT_BYTES
     }
@@ -296,7 +296,7 @@ pub fn columns<'py>(
     ))
 }
 
-/// Returns the number of frames, given the robots per world, the first robot, the number of robots and the flags.
+/// Returns the number of frames. The arguments are robots per world, first robot, number of robots, and flags.
 fn n_frames((team, first_robot, n_robots, flags): (u32, u32, u32, u32)) -> usize {
     match flags & FLAG_TEAM_FRAMES {
         0 => n_robots as usize,

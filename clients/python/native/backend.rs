@@ -63,8 +63,8 @@ pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
     Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
 }
 
-/// Reads settings and their files. Pipes, devices and other special files are read on a separate thread, so that the
-/// wait for them can time out or be interrupted.
+/// Reads settings and the files that they name. A separate thread reads pipes, devices and other special files, so that
+/// waiting for them can time out or be interrupted.
 fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
     let given: Map<String, Value> =
         serde_json::from_str(settings).map_err(|error| refused(py, &error.to_string()))?;

@@ -32,7 +32,7 @@ pub struct Transition {
     work: Mutex<Work>,
 }
 
-/// The operator and its work space, for one application at a time.
+/// The operator and its work space, which allow one application at a time.
 struct Work {
     /// The operator, or the error that `apply` raises because eq. 3 could divide by zero.
     operator: Result<transition::Transition<f64>, ModelError>,
@@ -45,7 +45,7 @@ impl Transition {
     #[new]
     fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
         let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
-        // Memory for two beliefs, and for a third one with margins in the work space.
+        // Memory for two beliefs, and for a third belief with margins, in the work space.
         let n_bytes = 3 * parameters.n_states() * shape.n_cells() * size_of::<f64>();
         check_memory(py, "beliefs", n_bytes)?;
         let none = Array3::zeros((parameters.n_states(), height, width));
@@ -134,8 +134,8 @@ pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
     }
 }
 
-/// Corrects beliefs in place by Bayes' rule (eq. 5) in the cells that frames `[n, H, W]` show; `likelihood` is `P(y |
-/// x)`, `[S, O]`.
+/// Corrects beliefs in place by Bayes' rule (eq. 5), in the cells that the frames `[n, H, W]` show. `likelihood` is
+/// `P(y | x)`, `[S, O]`.
 #[pyfunction]
 pub fn correct<'py>(
     py: Python<'py>,
@@ -184,7 +184,7 @@ fn shown(frames: ArrayView3<'_, u8>) -> Vec<(usize, u8)> {
     values.filter(|&(_, value)| value != UNOBSERVED).collect()
 }
 
-/// Simulates 64 worlds. Returns the share of them in which each cell is in each state after the burn-in, `[S, H, W]`.
+/// Simulates 64 worlds. Returns the share of worlds in which each cell is in each state after the burn-in, `[S, H, W]`.
 #[pyfunction]
 pub fn simulated_prior<'py>(
     py: Python<'py>,

@@ -22,10 +22,10 @@ use pyo3::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Steps that are expected to be shorter than this keep the interpreter locked: 1 ms, in nanoseconds.
+/// Expected step duration below which the interpreter stays locked: 1 ms, in nanoseconds.
 const BRIEF_NANOS: u64 = 1_000_000;
 
-/// A connection to a server, or worlds in this process. Threads may share it: they take turns.
+/// A connection to a server, or worlds in this process. Threads can share it and then take turns.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Server {
     pub worlds: Owned<Worlds>,
@@ -155,9 +155,9 @@ impl Server {
         Ok(Answer::of(py, team, self.shape, &reply, payload))
     }
 
-    /// Returns whether a step of this number of robots should be so short that it can keep the interpreter locked.
-    /// Taking the interpreter back from a busy thread costs 5 ms. Returns `false` before the first step, whose duration
-    /// is unknown.
+    /// Returns whether a step of this number of robots is expected to be so short that it can keep the interpreter
+    /// locked. Taking the interpreter back from a busy thread costs 5 ms. Before the first step, returns `false`
+    /// because no duration is known.
     pub fn is_brief(&self, n_robots: u32) -> bool {
         let nanos = self.nanos_of_robot.load(Ordering::Relaxed);
         self.is_embedded && nanos > 0 && nanos.saturating_mul(n_robots.into()) < BRIEF_NANOS
@@ -170,7 +170,7 @@ impl Server {
     }
 }
 
-/// Copies a world's latest result and hidden states, which needs no interpreter.
+/// Copies a world's latest result and hidden states. Needs no lock on the interpreter.
 fn copied((world, episode): (usize, &Episode)) -> (usize, WorldResult, Array2<u8>) {
     (
         world,

@@ -34,7 +34,7 @@ pub fn interrupted() -> bool {
         })
 }
 
-/// Turns an exception into the error of an interrupted wait, for which [`raise`] raises the exception.
+/// Stores an exception, and returns the error of an interrupted wait, for which [`raise`] returns the exception.
 pub fn interruption(raised: PyErr) -> ConnectionError {
     RAISED.set(Some(raised));
     ChannelError::Interrupted.into()

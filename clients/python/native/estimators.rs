@@ -1,4 +1,4 @@
-//! The agent's estimators for Python: beliefs of one kind about `n` worlds, corrected with frames.
+//! The agent's estimators for Python: beliefs of one kind about `n` worlds, which frames correct.
 
 use crate::detached::detached;
 use crate::model::{model_of, shape_of};
@@ -35,7 +35,7 @@ pub struct Estimators {
     kind: &'static str,
     #[pyo3(get)]
     state_names: Vec<String>,
-    /// The number, from 0, of the state with the largest reward.
+    /// Index of the state with the highest reward.
     #[pyo3(get)]
     target_state: usize,
     #[pyo3(get)]
@@ -185,7 +185,7 @@ impl Estimators {
         reset.map_err(|error| raise(py, &error))
     }
 
-    /// Corrects the beliefs about the chosen worlds with their frames; `frames` holds one per world, `[n, H, W]`.
+    /// Corrects the beliefs about the chosen worlds with their frames. `frames`, `[n, H, W]`, has one frame per world.
     fn correct(
         &self,
         py: Python<'_>,
@@ -235,8 +235,8 @@ impl Estimators {
         Ok(())
     }
 
-    /// Scores the beliefs against hidden states `[n, H, W]`. Returns one array each of log losses, Brier scores for the
-    /// state `target`, and shares of cells whose most probable state is right.
+    /// Scores the beliefs against hidden states `[n, H, W]`. Returns three arrays with one value per world: log losses,
+    /// Brier scores for the state `target`, and shares of cells whose most probable state is right.
     fn scores<'py>(
         &self,
         py: Python<'py>,
@@ -267,7 +267,7 @@ impl Estimators {
     }
 
     /// Scores the beliefs' predictions of frames `[n, H, W]`. Returns the log-likelihood, summed over the observed
-    /// cells, and their number.
+    /// cells, and the number of observed cells.
     fn score_frames<'py>(
         &self,
         py: Python<'py>,
@@ -363,7 +363,7 @@ impl Estimators {
     }
 }
 
-/// Predicts all worlds, in one batch if their kind supports it.
+/// Predicts the beliefs about all worlds, in one batch if the kind of estimator supports it.
 fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     match worlds.first().and_then(|first| first.predict_together()) {
         Some(together) => together(worlds),

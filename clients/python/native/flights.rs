@@ -1,4 +1,4 @@
-//! Paths that many robots fly move by move, one row per robot: cells, visited cells and rewards.
+//! Paths that many robots fly move by move. Each row belongs to one robot: its cell, visited cells and reward.
 
 use crate::airspace::Given;
 use crate::errors::check_memory;
@@ -27,7 +27,7 @@ type Arguments = (
 
 /// The current path of each robot, up to its latest move.
 ///
-/// No method unlocks the interpreter: another thread that reads this object meanwhile would find it borrowed.
+/// No method unlocks the interpreter: another thread that reads this object meanwhile would get an error.
 #[pyclass(module = "emberwatch._native")]
 pub struct Flights {
     shape: Shape,
@@ -35,8 +35,8 @@ pub struct Flights {
     /// The Python `Airspace` that this was built from.
     given: Option<Py<PyAny>>,
     n_moves: usize,
-    /// The reward of each hidden state, paid when its cell is first visited, or first seen if the sensor pays for seen
-    /// cells. `None`: no rewards.
+    /// The reward of each hidden state. It is paid when a cell in that state is first visited, or first seen if the
+    /// sensor pays for seen cells. `None`: no rewards.
     reward: Option<Vec<f64>>,
     cells: Vec<Cell>,
     n_made: Vec<usize>,
@@ -239,13 +239,13 @@ impl Flights {
         &self.cells
     }
 
-    /// Returns the share of a path's moves that are left, times 255.
+    /// Returns the share of a path's moves that remain, times 255.
     pub fn share_left(&self, row: usize) -> u8 {
         let made = self.n_made[row] as f64 / self.n_moves as f64;
         (255.0 * (1.0 - made)).round_ties_even() as u8
     }
 
-    /// Clears the visited cells of the rows marked in `begun`, and stores their hidden states.
+    /// Clears the visited cells of the rows marked in `begun`, and stores the hidden states of these rows.
     fn enter(&mut self, begun: ArrayView1<'_, bool>, states: Option<ArrayView3<'_, u8>>) {
         let n_cells = self.shape.n_cells();
         for row in (0..begun.len()).filter(|&row| begun[row]) {

@@ -1,5 +1,5 @@
-//! Hooks for forks of this process. A fork waits until no thread creates or removes a channel; the child forgets the
-//! process id of its parent.
+//! Hooks for forks of this process. A fork waits until no thread is creating or removing a channel. The child clears
+//! the cached process id of its parent.
 
 use crate::owned::forget_pid;
 #[cfg(target_os = "linux")]

@@ -1,4 +1,4 @@
-//! A lease: the right to fly consecutive robots. Remembers the step k of each world, which its next path is for.
+//! A lease: the right to fly consecutive robots. Remembers, for each world, the step k that the next paths start from.
 
 use crate::answer::Answer;
 use crate::backend::Worlds;
@@ -28,7 +28,7 @@ impl Lease {
         Self { server, lease }
     }
 
-    /// Flies a path with each robot. Returns `None` if the paths must be converted first, see `moves::paths`.
+    /// Flies a path with each robot. Returns `None` if the paths must be converted first (see `moves::paths`).
     fn step(
         &self,
         py: Python<'_>,
@@ -46,9 +46,9 @@ impl Lease {
         self.server.get().answered(py, answer, seconds).map(Some)
     }
 
-    /// Flies a path with each robot, and resends the paths until the worlds have moved. Returns the latest results, and
-    /// the number of steps missed before them; `None` as in `step`. With `accepts_late`, a world that moved on without
-    /// these paths is not an error.
+    /// Flies a path with each robot, and resends the paths until the worlds have stepped. Returns the latest results,
+    /// and the number of missed steps before these; `None` as in `step`. With `accepts_late`, it is no error if a world
+    /// steps without these paths.
     fn fly(
         &self,
         py: Python<'_>,
@@ -114,7 +114,7 @@ impl Lease {
         Call::new(request, moves, duration(seconds))
     }
 
-    /// Checks that the lease holds these robots. Returns their paths as bytes; `None` as in `moves::paths`.
+    /// Checks that the lease includes these robots. Returns their paths as bytes, or `None` as `moves::paths` does.
     fn moves(
         &self,
         paths: &Bound<'_, PyAny>,
@@ -131,7 +131,7 @@ impl Lease {
         Ok(moves::paths(paths, n_robots as usize, info.n_moves))
     }
 
-    /// Sends a request while no other thread uses the connection, so that threads send paths for different steps.
+    /// Sends a request while no other thread uses the connection, so that threads never send paths for the same step.
     fn ask(&self, py: Python<'_>, call: &mut Call<'_>) -> Result<StepAnswer, ConnectionError> {
         let (server, request) = (self.server.get(), *call.request());
         let send = |worlds: &mut Worlds| self.lease.send(worlds.backend(), call);

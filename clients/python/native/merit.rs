@@ -1,4 +1,4 @@
-//! Figures of merit of the runs of several worlds.
+//! Figures of merit of runs on several worlds.
 
 use crate::errors::check_memory;
 use crate::model::shape_of;
@@ -90,7 +90,7 @@ impl MeritTally {
 }
 
 impl MeritTally {
-    /// Refuses arrays whose shapes do not fit each other, and robots off the grid.
+    /// Checks that the shapes of the arrays match, and that the robots are on the grid.
     fn check(
         &self,
         py: Python<'_>,
@@ -139,7 +139,7 @@ impl MeritTally {
     }
 }
 
-/// Returns each robot's flight to its end cell. The first flight holds all visited cells, which count for the team.
+/// Returns each robot's flight to its end cell. The first flight includes all visited cells, which count for the team.
 fn flights(visited: ArrayView2<'_, bool>, robots: ArrayView2<'_, i64>) -> Vec<Flight> {
     let cells = visited.iter().enumerate().filter(|(_, visited)| **visited);
     let mut all: Vec<usize> = cells.map(|(index, _)| index).collect();

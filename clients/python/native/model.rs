@@ -89,7 +89,7 @@ pub fn model_of(text: &str) -> PyResult<Model> {
     Model::from_toml(text).map_err(refused)
 }
 
-/// Returns the shape of a grid, or the error of a side out of range.
+/// Returns the shape of a grid. Raises an error if a side is out of range.
 pub fn shape_of(py: Python<'_>, height: usize, width: usize) -> PyResult<Shape> {
     let expected = format!("height and width within 1 to {MAX_SIDE}");
     let got = format!("{height} x {width}");

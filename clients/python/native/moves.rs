@@ -19,7 +19,7 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> Optio
     check_moves(&moves).is_ok().then_some(moves)
 }
 
-/// Like [`paths`], but returns an array `[n_robots, n_moves]`.
+/// Converts paths as [`paths`] does, but returns an array `[n_robots, n_moves]`.
 #[pyfunction]
 pub fn moves<'py>(
     given: &Bound<'py, PyAny>,
@@ -55,7 +55,7 @@ fn read<T: Element + Copy>(
     (n_robots, n_moves): (usize, usize),
     byte: impl Fn(T) -> u8,
 ) -> Option<Vec<u8>> {
-    // Subclasses are not plain: they may mask values.
+    // Subclasses of the array type are not plain, because they can mask values.
     let is_plain = given.get_type().is(PyUntypedArray::type_object(given.py()));
     let array = is_plain.then(|| given.extract::<PyReadonlyArrayDyn<'_, T>>());
     let array = array?.ok()?;

@@ -76,8 +76,8 @@ pub struct Options {
 
 #[pymethods]
 impl Options {
-    /// Checks all arguments; [`Self::begin`] starts beliefs. `watched`: the instance in which beliefs are published,
-    /// and the number there of the first world here.
+    /// Checks all arguments; [`Self::begin`] starts beliefs. `watched` is the instance in which beliefs are published,
+    /// and the number that the first of these worlds has in that instance.
     #[new]
     fn new(
         py: Python<'_>,
@@ -129,8 +129,8 @@ impl Options {
         })
     }
 
-    /// Starts episodes: gives each of `worlds` the first belief and a seed. The first call may simulate that belief,
-    /// which takes seconds.
+    /// Starts an episode in each of `worlds`, with the first belief and a seed. The first call may have to simulate the
+    /// first belief, which takes seconds.
     fn begin(&self, py: Python<'_>, worlds: Vec<usize>, seeds: Vec<u64>) -> PyResult<()> {
         let prior = match self.prior.get() {
             Some(prior) => prior,
@@ -180,8 +180,8 @@ impl Options {
         seen?.map_err(|error| raise(py, &error))
     }
 
-    /// Updates beliefs with the present step of `worlds`, then plans all options. Without `frames`, the beliefs include
-    /// the step already. `flown`: the options that the robots have just flown. Returns features
+    /// Updates beliefs with the present step of `worlds`, then plans all options. Without `frames`, the beliefs already
+    /// include this step. `flown` lists the options that the robots have just flown. Returns features
     /// `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds.
     fn plan<'py>(
         &self,
@@ -211,7 +211,7 @@ impl Options {
     }
 }
 
-/// Returns the worlds' model. If it is hidden, and the estimator needs none, returns a stand-in without dynamics.
+/// Returns the worlds' model. If the model is hidden and the estimator needs none, returns a stand-in without dynamics.
 fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Model> {
     if let Some(model) = &spec.model {
         return model_of(&model.toml);

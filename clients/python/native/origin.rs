@@ -46,7 +46,7 @@ impl Origin {
     /// Builds the beliefs about `n_worlds` worlds, each with `n_states` states.
     ///
     /// # Errors
-    /// If there is not enough memory, or the model or checkpoint gives no belief on this grid.
+    /// If there is not enough memory, or if the model or checkpoint provides no belief on this grid.
     pub fn estimators(
         &self,
         py: Python<'_>,
@@ -58,7 +58,7 @@ impl Origin {
             let what = format_args!("the beliefs about {n_worlds} worlds");
             check_memory(py, what, n_worlds.saturating_mul(of_world))
         };
-        // Every kind keeps a belief and its predictor; the first estimator, once built, reports all of its memory.
+        // Every kind keeps at least a belief and a predictor. Once built, the first estimator reports its full memory.
         memory(2 * n_states * self.shape.n_cells() * size_of::<f32>())?;
         let first = py.detach(|| self.estimator());
         let first = first.map_err(|error| unfit(py, &error))?;
@@ -77,8 +77,8 @@ impl Origin {
         worlds.map_err(|error| unfit(py, &error))
     }
 
-    /// Returns whether a step is too short to share between threads: a step of the plain filter, or of a single world.
-    /// Networks start threads themselves, which must be the pool's.
+    /// Returns whether a step is too short to divide among threads, as it is for the plain filter or a single world.
+    /// Never true for networks: they use threads themselves, which must be the pool's.
     pub fn is_short(&self, n_worlds: usize) -> bool {
         let is_network = [&NEURAL, &NEURAL_SENSOR, &AUTOENCODER].contains(&self.kind);
         *self.kind == KNOWN || (n_worlds <= 1 && !is_network)
@@ -94,7 +94,7 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
 pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static BeliefKind> {
     let serves =
         |kind: &&BeliefKind| kind.input == Input::Frames && kind.learned_by.is_some() == is_learned;
-    // Text that UTF-8 cannot encode is no name either.
+    // Text that UTF-8 cannot encode is treated as an unknown name.
     let found = name.extract::<&str>().ok().and_then(named);
     if let Some(kind) = found.filter(serves) {
         return Ok(kind);
@@ -104,7 +104,7 @@ pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static B
     Err(invalid(name.py(), "kind", expected, name.repr()?))
 }
 
-/// Makes the error of a prior that is no belief.
+/// Makes the error of a prior that is not a valid belief.
 pub fn no_prior(py: Python<'_>, error: BeliefError) -> PyErr {
     match error {
         BeliefError::Simplex { cell, got } => {

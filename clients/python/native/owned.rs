@@ -1,4 +1,4 @@
-//! Values that belong to the process that made them, and that only one thread may use at a time.
+//! Values that belong to the process that created them, and that only one thread can use at a time.
 
 use crate::errors::{error, interrupted, raise_of_channel};
 use emberwatch_messages::errors::ChannelError;
@@ -23,7 +23,7 @@ pub struct Owned<T: Send> {
 
 enum Slot<T> {
     Free(T),
-    /// In use by a thread.
+    /// A thread is using the value.
     Taken,
     Closed,
 }
@@ -47,7 +47,7 @@ impl<T: Send> Owned<T> {
     /// Uses the value while the interpreter is released to other threads.
     ///
     /// # Errors
-    /// If the value is closed, another process made it, or the wait for other threads was interrupted.
+    /// If the value is closed, if another process made it, or if the wait for other threads was interrupted.
     pub fn with<R: Send>(
         &self,
         py: Python<'_>,
@@ -68,11 +68,11 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Like [`Self::with`], for short work: keeps the interpreter, unless another thread is using the value. Notices
-    /// forks by Python's hooks alone: call [`Self::check`] before work that other threads share.
+    /// Uses the value for short work. Unlike [`Self::with`], keeps the interpreter locked unless another thread uses
+    /// the value. Notices only forks that run Python's hooks: call [`Self::check`] before work that threads share.
     ///
     /// # Errors
-    /// Like [`Self::with`].
+    /// As for [`Self::with`].
     pub fn with_briefly<R: Send>(
         &self,
         py: Python<'_>,
@@ -187,8 +187,8 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits until the value is free, but at most one interval: a thread that gave up may have used up the
-    /// notification.
+    /// Waits until the value is free, but at most one interval, because a thread that stopped waiting may have consumed
+    /// the notification.
     fn wait(&self, slot: MutexGuard<'_, Slot<T>>) {
         let waited = self.freed.wait_timeout(slot, INTERVAL);
         drop(waited.unwrap_or_else(PoisonError::into_inner));
@@ -227,8 +227,8 @@ fn pid() -> u32 {
     std::process::id()
 }
 
-/// Returns the id of this process, with a system call only on the first use. Misses a fork that does not run Python's
-/// hooks, so it is only for work in which no other thread of the parent takes part.
+/// Returns the id of this process, with a system call only on the first use. Does not notice a fork that runs without
+/// Python's hooks, so it serves only work in which no other thread of the parent takes part.
 fn known_pid() -> u32 {
     match PID.load(Ordering::Relaxed) {
         0 => {

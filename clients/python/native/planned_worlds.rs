@@ -31,11 +31,11 @@ pub struct Watched {
     pub instance: Instance,
     /// The number, in the instance, of the first world here.
     pub first_world: u32,
-    /// Opened with the first frame.
+    /// `None` until the first frame, which opens the channel.
     pub feed: Option<Feed>,
 }
 
-/// What has been observed in some worlds, one row per world.
+/// The observations of some worlds, one row per world.
 #[derive(Clone, Copy)]
 pub struct Observed<'a> {
     pub worlds: &'a [usize],
@@ -87,10 +87,10 @@ impl PlannedWorlds {
         self.worlds.get_mut(world)?.as_mut()
     }
 
-    /// Begins episodes with a first belief. `seeds` holds pairs of a world and its seed.
+    /// Begins episodes with a first belief. `seeds` lists pairs of a world and its seed.
     ///
     /// # Errors
-    /// If a world's number is out of range, or a belief cannot be built.
+    /// If a world's number is out of range, or if a belief cannot be built.
     pub fn begin(
         &mut self,
         seeds: impl Iterator<Item = (usize, u64)>,
@@ -112,7 +112,7 @@ impl PlannedWorlds {
         Ok(())
     }
 
-    /// Updates beliefs with frames, and plans all options if `plans`.
+    /// Updates beliefs with frames. If `plans` is set, then plans all options.
     ///
     /// # Errors
     /// If the arrays differ in length, a world's number is out of range, or a belief refuses its frame.
@@ -178,7 +178,7 @@ impl PlannedWorlds {
         (features, paths)
     }
 
-    /// Selects the rows to publish now, among `n_worlds`. Opens the channel the first time.
+    /// Selects the rows to publish now, among `n_worlds`. The first call opens the channel.
     fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
         let begun = self.worlds.iter().flatten().next();
         let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
@@ -289,8 +289,8 @@ impl WorldWork<'_> {
     }
 }
 
-/// Returns whether the work is too short to share between threads, as it is for a single world. Networks start threads
-/// themselves, which must be the pool's.
+/// Returns whether the work is too short to divide among threads, as it is for a single world. Never true for
+/// networks: they use threads themselves, which must be the pool's.
 fn is_short(crew: &Crew, n_worlds: usize) -> bool {
     n_worlds == 1 && *crew.estimator() != NEURAL
 }

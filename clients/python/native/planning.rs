@@ -1,4 +1,4 @@
-//! Beam search in many worlds.
+//! Beam search in many worlds at once.
 
 use crate::airspace::Given;
 use crate::errors::{check_memory, interrupted, raise_of_channel};
@@ -44,7 +44,7 @@ pub fn beam_search<'py>(
         None => Airspace::open(shape),
         Some(given) => given.on_grid(py, shape)?,
     };
-    // A beam never keeps more states than there are paths.
+    // A beam never contains more states than there are paths.
     let n_paths = 4_usize.saturating_pow(n_moves as u32);
     check(py, &airspace, n_moves, (width, width.min(n_paths)))?;
     let mut paths = Array2::zeros((n_worlds, n_moves));
@@ -87,7 +87,7 @@ fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
     }
 }
 
-/// Refuses arguments out of range, and beams that need more memory than allowed or available.
+/// Checks that the arguments are in range, and that the beam needs no more memory than allowed and available.
 fn check(
     py: Python<'_>,
     airspace: &Airspace,
@@ -105,7 +105,7 @@ fn check(
         Pays::Visited => 0,
         Pays::Seen => set_bytes(airspace.radius()),
     };
-    // Each state has sets of cells, before and after a move, and a link to its predecessor for each move.
+    // Each state has two sets of cells, before and after a move, and for each move a link to its predecessor.
     let state_bytes = 2 * (set_bytes(0) + sight_bytes) + n_moves * 8;
     let widest = MAX_WIDTH.min(MAX_BYTES / state_bytes);
     if !(1..=widest).contains(&width) {

@@ -1,11 +1,11 @@
-//! Errors of invalid arguments, and descriptions of the server's refusals.
+//! Errors about invalid arguments, and descriptions of the server's refusals.
 
 use crate::errors::error;
 use emberwatch_messages::message::Status;
 use pyo3::prelude::*;
 use std::fmt::Display;
 
-/// Returns the name of a status code and a sentence that explains it; `None` if no refusal has the code.
+/// Returns the name of a status code and a sentence that explains it; `None` if the code is not that of a refusal.
 #[pyfunction]
 pub fn explain(status: u32, detail: u64) -> Option<(String, String)> {
     let status = Status::try_from(status).ok()?;

@@ -56,7 +56,7 @@ pub trait Published {
     fn version(&self) -> u32;
     fn world(&self) -> u32;
     fn sequence(&self) -> u64;
-    /// The id of the process that numbers the samples; 0 where only the server does.
+    /// The id of the process that numbers the samples; 0 on channels where only the server publishes.
     fn publisher(&self) -> u32;
 }
 
@@ -87,7 +87,7 @@ published!(FrameHeader, |_| 0);
 published!(TruthHeader, |_| 0);
 published!(AgentHeader, |header| header.pid);
 
-/// Refuses a sample of another protocol version.
+/// Checks that a sample has this protocol version.
 pub fn check_version(header: &impl Published) -> Result<(), String> {
     match header.version() {
         VERSION => Ok(()),

@@ -32,7 +32,7 @@ impl Pool {
         }
         match &self.threads {
             Some(threads) => threads.install(|| work(Threads::Several)),
-            // The system starts no more threads.
+            // The system cannot start more threads.
             None => work(Threads::One),
         }
     }

@@ -13,11 +13,11 @@ use pyo3::types::PyType;
 
 type Arguments = (usize, usize, usize, usize, usize, Py<PyAny>);
 
-/// Number of channels about the path, which follow the channels about the world: cells that this path has visited,
-/// cells off the grid or no-fly, and the share of the path that is left.
+/// Number of channels about the path: cells that this path has visited, cells off the grid or no-fly, and the remaining
+/// share of the path. They come after the channels about the world.
 const N_OF_PATH: usize = 3;
 
-/// Maps of many robots, one row per robot. Each map has a margin around the grid, so that every window is a part of the
+/// Maps of many robots, one row per robot. Each map has a margin around the grid, so that every window lies within the
 /// map.
 #[pyclass(module = "emberwatch._native")]
 pub struct Windows {
@@ -25,7 +25,7 @@ pub struct Windows {
     side: usize,
     n_channels: usize,
     n_rows: usize,
-    /// Radius, in rows and columns, of the cells that pay when a robot visits a cell.
+    /// Radius, in rows and columns, of the square of cells whose rewards are paid when a robot visits a cell.
     reach: usize,
     maps: Vec<u8>,
     /// The Python `Airspace` that this was built from.
@@ -107,7 +107,7 @@ impl Windows {
     }
 
     /// Updates the maps of the rows marked in `moved`: marks each robot's cell as visited, and clears the world
-    /// channels of all cells that have paid, as nothing is left to be found there.
+    /// channels of all cells whose reward has been paid, because nothing remains to be found there.
     fn visit(&mut self, flights: &Flights, moved: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let moved = moved.as_array();
         if moved.len() != self.n_rows || flights.cells().len() != self.n_rows {
@@ -173,13 +173,13 @@ impl Windows {
         }
     }
 
-    /// Returns the index in the maps of a cell of the grid.
+    /// Returns a grid cell's index in the maps.
     fn index(&self, row: usize, cell: Cell) -> usize {
         let margin = self.side / 2;
         self.padded(row, cell.row + margin, cell.col + margin)
     }
 
-    /// Returns the index in the maps of a cell whose row and column count from the margin's corner.
+    /// Returns a cell's index in the maps. `y` and `x` count from the corner of the margin.
     fn padded(&self, row: usize, y: usize, x: usize) -> usize {
         let (height, width) = self.shape.dim();
         let (height, width) = (height + self.side - 1, width + self.side - 1);

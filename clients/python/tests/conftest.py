@@ -22,7 +22,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # Finds programs that pip installed next to Python.
 os.environ["PATH"] += os.pathsep + str(Path(sys.executable).parent)
 
-# Replaces the user's cache folder by one that cannot be written.
+# Replaces the user's cache folder with one that cannot be written to.
 os.environ["XDG_CACHE_HOME"] = "/dev/null"
 
 # PyTorch's networks are so small here that more threads would only wait for each other.

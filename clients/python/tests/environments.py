@@ -30,7 +30,7 @@ FLAGS: dict[str, Any] = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "mo
 
 @contextlib.contextmanager
 def serving(**flags: object) -> Iterator[str]:
-    """Starts a server of `SMALL` worlds with `flags`. Returns its instance name."""
+    """Starts a server of `SMALL` worlds with `flags`. Yields its instance name."""
     with contextlib.closing(Server(**{**FLAGS, **flags}, ready=False)) as started:
         yield started.instance
 
@@ -56,7 +56,7 @@ def make_vec(n_worlds: int, name: str = WILDFIRE, **keywords: Any) -> Any:
 
 @contextlib.contextmanager
 def impatient(env: Any, seconds: float = 0.2) -> Iterator[None]:
-    """Limits the time that calls of an environment wait."""
+    """Limits how long calls of an environment wait."""
     session = env.unwrapped._session
     kept = session.settings
     session.settings = dataclasses.replace(kept, timeout=seconds)
@@ -74,7 +74,7 @@ def no_warnings() -> Iterator[None]:
     """Turns warnings into errors, including those of Gymnasium's logger."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Irrelevant to these tests: the smallest worlds may hold nothing to find.
+        # Irrelevant to these tests: the smallest worlds may contain nothing to find.
         warnings.filterwarnings("ignore", "no cell of world")
         # Rewards and features of plans are unbounded, and a table of plans is not an image.
         warnings.filterwarnings("ignore", ".*Box observation space (min|max)imum value is")
@@ -83,7 +83,7 @@ def no_warnings() -> Iterator[None]:
 
 
 def actions(env: Any, n_steps: int, seed: int = 0) -> list[Any]:
-    """Yields random actions of an environment, which depend only on the seed."""
+    """Returns random actions of an environment, which depend only on the seed."""
     env.action_space.seed(seed)
     return [env.action_space.sample() for _ in range(n_steps)]
 

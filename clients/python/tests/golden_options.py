@@ -1,7 +1,7 @@
 """Recorded episodes of `WildfireObjective-v1`, which were planned by a separate process.
 
-`data/options.npz` holds the episodes, and the checkpoints of the learned beliefs: two filters and a
-network, trained for 80 steps in these worlds. The network's weights are rounded to 16 bits.
+`data/options.npz` contains the episodes, and the checkpoints of the learned beliefs: two filters
+and a network, trained for 80 steps in these worlds. The network's weights are rounded to 16 bits.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ Cells = NDArray[np.bool_]
 #: A ring whose observations are exact, and differ from the observations of other rings.
 RING = {"observed_as": np.eye(3).tolist()}
 
-#: Cells of a 7 x 5 grid where no robot may be; the corner (0, 4) has no way out.
+#: Cells of a 7 x 5 grid where no robot may be; the corner (0, 4) is enclosed.
 NO_FLY: Cells = np.array(
     [
         [0, 0, 0, 1, 0],

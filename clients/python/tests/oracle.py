@@ -13,7 +13,7 @@ class Parameters(NamedTuple):
     #: ``w[own, to, from, row, col]``: one kernel, or one per state of the cell itself, per zone.
     kernels: Array
     bias: Array
-    #: ``P(observed value | state)``: a row per state; the columns of the rings follow each other.
+    #: ``P(observed value | state)``: one row per state; the matrices of all rings side by side.
     observed: Array
     initial: Array
     #: The zone of each cell, if the model has zones.
@@ -47,7 +47,7 @@ def parameters(text: str) -> Parameters:
 
 
 def phi(model: Parameters, belief: Array) -> Array:
-    """Predicts (eqs. 2-4). Kernels by the cell's own state are averaged over its belief."""
+    """Predicts (eqs. 2-4). Kernels for own states are averaged over the belief about the cell."""
     if model.zones is not None:
         of_zones = np.split(model.kernels, int(model.zones.max()) + 1)
         parts = [phi(model._replace(kernels=of, zones=None), belief) for of in of_zones]

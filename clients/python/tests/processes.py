@@ -81,7 +81,7 @@ class Program:
 
 
 def server(instance: str | None = None, *, ready: bool = True, **flags: object) -> Server:
-    """Starts a small server, `server(worlds=3, coverage="client")`, that ends with the test."""
+    """Starts a small server that ends with the test, as in `server(worlds=3)`."""
     return at_the_end.enter_context(closing(Server(instance, ready=ready, **SMALL | flags)))
 
 
@@ -118,7 +118,7 @@ class Server:
             raise
 
     def _shut_down(self) -> None:
-        """Asks the server to stop. This is quicker than a signal, which it notices only later."""
+        """Asks the server to stop. This is quicker than a signal, which the server notices late."""
         with suppress(EmberwatchError):
             self._client.shutdown(timeout=1.0)
 
@@ -204,7 +204,7 @@ def isolated(options: str, *, pids: bool = False) -> Run:
 
     trial = ["unshare", "-p", "-f", "--mount-proc", "true"] if pids else ["true"]
     if shutil.which("unshare") is None or run(*trial).returncode != 0:
-        pytest.skip("needs namespaces of its own: `unshare` is not permitted here")
+        pytest.skip("needs its own namespaces: `unshare` is not permitted here")
     return run
 
 
@@ -268,7 +268,7 @@ def services(instance: str) -> list[Path]:
 
 
 def at_once(*calls: Callable[[], Any]) -> list[Any]:
-    """Runs calls that wait for each other on one thread each. Returns their results."""
+    """Runs calls that wait for each other, each on its own thread. Returns their results."""
     results: list[Any] = [None] * len(calls)
 
     def run(index: int) -> None:

@@ -53,7 +53,7 @@ def seeing(tmp_path: Path) -> Any:
 
 
 @pytest.mark.parametrize("pays", ["visited", "seen"])
-def test_moves_lead_where_the_server_says(seeing: Any, pays: str) -> None:
+def test_moves_lead_where_the_server_reports(seeing: Any, pays: str) -> None:
     keywords = seeing(radius=1, n_rings=2, pays=pays)
     paths = make(**keywords, truth=True)
     late, early = (
@@ -91,7 +91,7 @@ def test_moves_lead_where_the_server_says(seeing: Any, pays: str) -> None:
 
 
 @pytest.mark.parametrize("pays", ["visited", "seen"])
-def test_windows_show_what_is_left_to_be_found(seeing: Any, pays: str) -> None:
+def test_windows_show_what_can_still_be_found(seeing: Any, pays: str) -> None:
     parts = {"observation": ("local", "recent", "belief", "robot"), "window": 5}
     env = make(MOVES, **seeing(radius=1, n_rings=2, pays=pays), **parts)
     seen, _ = env.reset(seed=1)
@@ -117,7 +117,7 @@ def test_windows_show_what_is_left_to_be_found(seeing: Any, pays: str) -> None:
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
-def test_the_checker_and_a_server_agree(seeing: Any, name: str) -> None:
+def test_airspace_passes_the_checker_and_equals_a_servers(seeing: Any, name: str) -> None:
     keywords = seeing(radius=2, n_rings=2, pays="seen", zone_map=np.eye(*SHAPE, dtype=np.uint8))
     parts = ALL_MOVES if name == MOVES else ("frame", "image", "robot", "age", "belief")
     here = make(name, **keywords, observation=parts)
@@ -135,7 +135,7 @@ def test_the_checker_and_a_server_agree(seeing: Any, name: str) -> None:
             assert info.zones.map.tolist() == np.eye(*SHAPE, dtype=int).tolist()
 
 
-def test_a_radius_may_be_given_beside_a_model() -> None:
+def test_a_radius_can_be_combined_with_a_model() -> None:
     wide = make(sensor_radius=8)
     assert wide.unwrapped.model.sensor_radius == 8
     assert (rollout(wide, 1, seed=1)[1][0]["frame"] != 255).sum() > 30
@@ -162,7 +162,7 @@ def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
         gymnasium.make(WILDFIRE, task=far)
 
 
-def test_recorded_worlds_are_seen_from_afar_too(tmp_path: Path) -> None:
+def test_recorded_worlds_support_sensor_radius(tmp_path: Path) -> None:
     path = tmp_path / "lab.npy"
     np.save(path, np.random.default_rng(1).integers(0, 3, (20, *SHAPE), np.uint8))
     rings = "rings = [{ observed_as = [[1, 0], [0, 1], [1, 0]] }]"
@@ -179,7 +179,7 @@ def test_recorded_worlds_are_seen_from_afar_too(tmp_path: Path) -> None:
         assert spec.description.observation_names == names[: 2 * n_rings]
 
 
-def test_a_model_says_what_its_file_does(tmp_path: Path) -> None:
+def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     zones = np.arange(35, dtype=np.uint8).reshape(SHAPE) & 1
     keys: dict[str, Any] = {"radius": 3, "n_rings": 2, "pays": "seen"}
     whole = Model.from_toml(land.model(**keys, no_fly=land.NO_FLY, zone_map=zones))
@@ -223,7 +223,7 @@ def test_a_model_says_what_its_file_does(tmp_path: Path) -> None:
     assert described.with_radius(4).airspace == Airspace(radius=4)
 
 
-def test_the_filter_knows_zones_and_rings() -> None:
+def test_the_filter_uses_zones_and_rings() -> None:
     rng = np.random.default_rng(2)
     zones = rng.integers(0, 2, SHAPE, np.uint8)
     text = land.model(radius=2, n_rings=2, zone_map=zones)
@@ -241,7 +241,7 @@ def test_the_filter_knows_zones_and_rings() -> None:
         Transition(model, height=5, width=5).apply(np.full((3, 5, 5), 1 / 3))
 
 
-def test_beams_are_planned_within_the_airspace() -> None:
+def test_beam_search_respects_the_airspace() -> None:
     values, robots = np.random.default_rng(4).random((2, *SHAPE)), np.array([(2, 2), (0, 4)])
     for airspace in (Airspace(no_fly=land.NO_FLY, radius=1, pays=it) for it in ("visited", "seen")):
         rng = np.random.default_rng(4)
@@ -254,11 +254,11 @@ def test_beams_are_planned_within_the_airspace() -> None:
 
         best = max(worth(every) for every in product(range(4), repeat=5))
         assert worth(paths[0]) == pytest.approx(best, abs=1e-5)
-        # The other robot has no way out.
+        # The other robot is enclosed.
         assert land.cells_of((0, 4), paths[1], land.NO_FLY)[-1] == (0, 4)
 
 
-def test_an_impossible_airspace_is_named() -> None:
+def test_an_invalid_airspace_is_refused() -> None:
     for keywords, words in (
         ({"radius": 9}, "radius: expected an integer within 0 to 8, got 9"),
         ({"radius": 1, "n_rings": 3}, "n_rings: expected an integer within 1 to 2, got 3"),
@@ -272,7 +272,7 @@ def test_an_impossible_airspace_is_named() -> None:
         Flights(1, 7, 5, 4, None, Airspace(no_fly=np.zeros((5, 7), bool)))
 
 
-def test_a_start_in_a_pocket_is_warned_of(tmp_path: Path) -> None:
+def test_an_enclosed_start_causes_a_warning(tmp_path: Path) -> None:
     no_fly = np.zeros((12, 9), int)
     no_fly[3:6, 3:7] = 1
     no_fly[4, 4:6] = 0

@@ -10,7 +10,7 @@ import emberwatch
 PACKAGE = Path(emberwatch.__file__).parent
 
 #: The layers of the package. Each imports only from the layers before it.
-ROOMS = (
+LAYERS = (
     "errors common model belief planning client render envs wrappers sb3 landscape benchmark"
 ).split()
 
@@ -38,25 +38,25 @@ def imports(path: Path) -> set[str]:
     return found
 
 
-def test_no_module_imports_itself_through_others() -> None:
+def test_there_are_no_import_cycles() -> None:
     graph = {name: imports(path) & modules().keys() for name, path in modules().items()}
     assert len(graph) > 30 and "emberwatch.client.wire" in graph["emberwatch.client.connection"]
     order = list(TopologicalSorter(graph).static_order())
     assert order.index("emberwatch.errors") < order.index("emberwatch.envs.path_env")
 
 
-def room(name: str) -> str:
+def layer(name: str) -> str:
     return f"{name}.__init__".split(".")[1]
 
 
-def test_rooms_import_only_from_those_below_them() -> None:
-    rooms = {room(name) for name in modules()}
-    assert rooms == {*ROOMS, "__init__", "__main__", "_native"}
+def test_layers_import_only_from_lower_layers() -> None:
+    layers = {layer(name) for name in modules()}
+    assert layers == {*LAYERS, "__init__", "__main__", "_native"}
     climbs = [
         f"{name} imports {other}"
         for name, path in modules().items()
         for other in imports(path) & modules().keys()
-        if {room(name), room(other)} <= set(ROOMS)
-        and ROOMS.index(room(other)) > ROOMS.index(room(name))
+        if {layer(name), layer(other)} <= set(LAYERS)
+        and LAYERS.index(layer(other)) > LAYERS.index(layer(name))
     ]
     assert climbs == []

@@ -99,7 +99,7 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
 
 
 @pytest.mark.parametrize("kind", ENVIRONMENTS)
-def test_a_wrong_action_is_named_and_not_flown(kind: str) -> None:
+def test_a_wrong_action_is_refused_and_not_flown(kind: str) -> None:
     assert WRONG.keys() <= ENVIRONMENTS.keys()
     maker, action, given = ENVIRONMENTS[kind]
     env = getattr(made := maker(), "unwrapped", made)
@@ -116,14 +116,14 @@ def test_a_wrong_action_is_named_and_not_flown(kind: str) -> None:
     assert np.all((seen["move"] if "move" in kind else steps) == 1)
 
 
-def test_seeds_of_any_library_are_alike() -> None:
+def test_seeds_of_any_library_are_equivalent() -> None:
     expected = make().reset(seed=5)
     for seed in (np.int64(5), np.uint8(5), np.array(5), np.array(5, ">i8")):
         assert_same(make().reset(seed=seed), expected)
         assert_same(make_vec(1).reset(seed=[seed])[0]["frame"], expected[0]["frame"][np.newaxis])
 
 
-def test_what_is_no_seed_is_refused_alike() -> None:
+def test_invalid_seeds_are_refused_everywhere() -> None:
     team = closed_later(emberwatch.parallel_env(robots=2, **SMALL))
     no_seeds = 5.0, np.array(5.0), np.array([5.0, 6.0]), "ab", np.ma.array(5, mask=True), {5, 6}
     for env in (make(), make(MOVES), make_vec(2), team):
@@ -132,7 +132,7 @@ def test_what_is_no_seed_is_refused_alike() -> None:
                 env.reset(seed=seed)
 
 
-def test_seeds_of_a_lease_are_one_for_each_world() -> None:
+def test_a_lease_takes_one_seed_per_world() -> None:
     env = make_vec(2)
     env.reset(seed=1)
     lease = env._session._lease
@@ -168,7 +168,7 @@ WRONG_VECTOR: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_wrong_arguments_of_a_reset_are_named() -> None:
+def test_wrong_reset_arguments_are_named() -> None:
     team = closed_later(emberwatch.parallel_env(robots=2, **SMALL))
     for env, more in ((make(), WRONG_SINGLE), (make_vec(2), WRONG_VECTOR), (team, [])):
         env.reset(seed=1)
@@ -177,7 +177,7 @@ def test_wrong_arguments_of_a_reset_are_named() -> None:
                 env.reset(**arguments)
 
 
-def test_what_does_not_show_itself_is_refused_in_its_own_words() -> None:
+def test_errors_show_why_an_argument_has_no_repr() -> None:
     team = closed_later(emberwatch.parallel_env(robots=2, action="path", **SMALL))
     team.reset(seed=1)
     for error in ELSEWHERE:
@@ -200,7 +200,7 @@ KEYWORDS: list[dict[str, Any]] = [
 ]
 
 
-def test_a_specification_is_json_that_makes_the_same_environment() -> None:
+def test_a_spec_survives_json() -> None:
     for keywords in KEYWORDS:
         env = make(**keywords)
         again = closed_later(gymnasium.make(EnvSpec.from_json(env.spec.to_json())))
@@ -218,14 +218,14 @@ def test_a_specification_is_json_that_makes_the_same_environment() -> None:
         assert_same(rolled(again, 2, seed=5), rolled(wrapped, 2, seed=5))
 
 
-def test_a_prior_that_is_no_array_is_refused() -> None:
+def test_a_prior_that_is_not_an_array_is_refused() -> None:
     with refuses(r"prior: expected an array of shape \(3, 7, 5\), got Elsewhere: no data"):
         BeliefObservation(make(), prior=Elsewhere(ELSEWHERE[2]))
     with refuses(r"prior: expected shape \(3, 7, 5\), got \(2,\)"):
         BeliefObservation(make(), prior=[0.5, 0.5])
 
 
-def test_modules_are_there_as_the_documents_write_them() -> None:
+def test_documented_modules_can_be_imported() -> None:
     assert emberwatch.wrappers.BeliefObservation is BeliefObservation
     assert callable(emberwatch.planning.beam_search) and callable(emberwatch.benchmark.evaluate)
     with pytest.raises(AttributeError, match="'emberwatch' has no attribute 'wrapers'"):

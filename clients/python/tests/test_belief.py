@@ -26,7 +26,7 @@ WILDFIRE = Model.wildfire()
 
 
 def golden(name: str) -> dict[str, NDArray[np.generic]]:
-    """Reads numbers of the authors' unmodified PyTorch code from the Rust tests' data."""
+    """Reads results of the authors' unmodified PyTorch code from the Rust tests' data."""
     folders = *REPOSITORY.glob("protocol/*/tests/data"), *REPOSITORY.glob("agent/*/tests/data")
     (path,) = (folder / f"{name}.npz" for folder in folders if (folder / f"{name}.npz").exists())
     with np.load(path) as file:
@@ -34,7 +34,7 @@ def golden(name: str) -> dict[str, NDArray[np.generic]]:
 
 
 def model_of(*, kernel: NDArray, bias: NDArray, matrix: NDArray) -> Model:
-    """Makes a model of any shape through a model file. Kernels of five axes are by own state."""
+    """Makes a model of any shape through a model file. Five axes mean one kernel per own state."""
     n_states, n_observations = matrix.shape
     lines = ['name = "test"', f"kernel_size = {list(kernel.shape[-2:])}"]
     for s in range(n_states):
@@ -54,7 +54,7 @@ def assert_near(got: NDArray, expected: NDArray, tolerance: float) -> None:
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance)
 
 
-def test_beliefs_are_the_authors() -> None:
+def test_beliefs_equal_the_authors_numbers() -> None:
     file = golden("a1_transition")
     states, belief = np.moveaxis(np.eye(3)[file["4x7_state"]], -1, 0), file["4x7_prob"]
     transition = Transition(WILDFIRE, height=4, width=7)
@@ -88,7 +88,7 @@ def any_model(draw: st.DrawFn) -> Model:
 
 @settings(deadline=None, max_examples=40)
 @given(any_model(), st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32))
-def test_beliefs_are_the_oracle_s_on_the_simplex(
+def test_beliefs_equal_the_oracle_and_stay_on_the_simplex(
     model: Model, height: int, width: int, key: int
 ) -> None:
     rng = np.random.default_rng(key)
@@ -117,7 +117,7 @@ def test_beliefs_are_the_oracle_s_on_the_simplex(
         assert_near(filter.entropy(), entropy(filter.belief.astype(np.float64)), 1e-6)
 
 
-def test_other_shapes_and_models_that_can_vanish_are_refused() -> None:
+def test_wrong_shapes_and_vanishing_models_are_refused() -> None:
     with refuses(r"belief: expected shape \(3, 2, 2\)"):
         Transition(WILDFIRE, height=2, width=2).apply(np.ones((3, 2, 3)))
     model = model_of(kernel=np.zeros((2, 2, 1, 1)), bias=np.zeros(2), matrix=np.ones((2, 1)))
@@ -126,7 +126,7 @@ def test_other_shapes_and_models_that_can_vanish_are_refused() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_filter_keeps_its_own_belief(dtype: type[np.floating]) -> None:
+def test_the_filter_copies_its_prior_and_its_belief(dtype: type[np.floating]) -> None:
     prior = uniform_prior(WILDFIRE, height=2, width=2).astype(dtype)
     filter = known(WILDFIRE, prior=prior)
     prior[:] = 0
@@ -134,7 +134,7 @@ def test_the_filter_keeps_its_own_belief(dtype: type[np.floating]) -> None:
     assert_near(filter.belief.sum(axis=0), np.ones((2, 2)), 1e-7)
 
 
-def test_entropy_of_known_distributions() -> None:
+def test_entropy_matches_known_distributions() -> None:
     uniform = uniform_prior(WILDFIRE, height=2, width=5)
     assert_near(entropy(uniform), np.full((2, 5), np.log(3)), 1e-12)
     certain = entropy(np.moveaxis(np.eye(3)[np.array([[0, 1, 2]])], -1, 0))

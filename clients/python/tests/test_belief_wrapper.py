@@ -23,7 +23,7 @@ GRID = {"height": 4, "width": 6}
 
 
 class Stub(gymnasium.Env[Any, Any]):
-    """An environment with random frames, which ``parts`` makes part of a Dict."""
+    """An environment with random frames. With ``parts``, a frame is part of a Dict."""
 
     def __init__(self, *, parts: bool = False, model: Model | None = WILDFIRE, burn_in: int = 0):
         self.model, self.burn_in, self.parts = model, burn_in, parts
@@ -87,7 +87,7 @@ def test_the_belief_follows_the_steps_of_the_world(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
-def test_it_passes_the_environment_checker_and_keeps_observations() -> None:
+def test_it_passes_the_checker_and_can_keep_observations() -> None:
     for parts, keep, dtype, names in (
         (False, False, "float32", None),
         (True, False, "uint8", None),
@@ -103,7 +103,7 @@ def test_it_passes_the_environment_checker_and_keeps_observations() -> None:
             assert (observation["frame"][:, :, 0] == env.unwrapped.frame).all()
 
 
-def test_images_are_beliefs_in_256_steps_channels_last() -> None:
+def test_images_are_beliefs_as_bytes_channels_last() -> None:
     envs = [BeliefObservation(Stub(), dtype=dtype) for dtype in ("uint8", "float32")]
     for env in envs:
         env.reset(seed=0)
@@ -125,7 +125,7 @@ def test_a_spec_makes_the_same_environment() -> None:
     assert (remade.reset()[0] == named.reset()[0]).all()
 
 
-def test_priors_by_name_and_by_array() -> None:
+def test_priors_are_given_by_name_or_array() -> None:
     given = np.moveaxis(np.random.default_rng(0).dirichlet(np.ones(3), SHAPE), -1, 0)
     initial, uniform = initial_prior(WILDFIRE, **GRID), uniform_prior(WILDFIRE, **GRID)
     for prior, expected in (("initial", initial), ("uniform", uniform), (given, given)):
@@ -142,7 +142,7 @@ def test_priors_by_name_and_by_array() -> None:
         BeliefObservation(Stub(), prior=given * 2)
 
 
-def test_a_hidden_model_must_be_given(tmp_path: Path) -> None:
+def test_a_hidden_model_must_be_passed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="the server does not reveal .* Pass model="):
         BeliefObservation(Stub(model=None))
     file = tmp_path / "model.toml"
@@ -154,7 +154,7 @@ def test_a_hidden_model_must_be_given(tmp_path: Path) -> None:
         BeliefObservation(Stub(), model=file)
 
 
-def test_other_environments_are_refused() -> None:
+def test_unsuitable_environments_are_refused() -> None:
     with pytest.raises(ValueError, match="a frame of shape"):
         BeliefObservation(gymnasium.make("CartPole-v1"), model=WILDFIRE)
     with pytest.raises(ValueError, match="dtype: expected 'float32' or 'uint8'"):
@@ -163,7 +163,7 @@ def test_other_environments_are_refused() -> None:
         BeliefObservation(Stub()).step(None)
 
 
-def test_it_observes_beliefs_of_other_kinds(tmp_path: Path) -> None:
+def test_it_observes_other_kinds_of_belief(tmp_path: Path) -> None:
     stub = Stub()
     env = BeliefObservation(stub, kind="known+spatial")
     expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID), kind="known+spatial")

@@ -64,7 +64,7 @@ def states(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("robots", "recent_steps", "policy"), [(3, 2, "beam_exploit"), (1, 3, "coverage")]
 )
-def test_paths_flown_again_score_the_same_to_the_digit(
+def test_replayed_paths_have_exactly_the_same_scores(
     tmp_path: Path, states: Path, robots: int, recent_steps: int, policy: str
 ) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
@@ -113,7 +113,7 @@ def test_paths_flown_again_score_the_same_to_the_digit(
         assert None not in [getattr(mine, value) for value in MERIT]
 
 
-def test_rows_stand_beside_the_ladder(tmp_path: Path) -> None:
+def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
     file, figures = tmp_path / "mine.csv", tmp_path / "figures"
     score(file)
     score(file, name="other")
@@ -134,7 +134,7 @@ def test_rows_stand_beside_the_ladder(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_rows_of_other_worlds_are_refused(
+def test_rows_on_other_worlds_are_refused(
     tmp_path: Path, changes: dict[str, Any], problem: str
 ) -> None:
     file = tmp_path / "mine.csv"
@@ -144,7 +144,7 @@ def test_rows_of_other_worlds_are_refused(
     assert done.stderr.count("--add") == 1
 
 
-def test_an_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_an_evaluation_continues_where_it_stopped(tmp_path: Path) -> None:
     file, told = tmp_path / "new" / "mine.csv", io.StringIO()
     whole = score(batch=4)
     score(file, name="other")
@@ -159,7 +159,7 @@ def test_an_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert list(file.parent.iterdir()) == [file]
 
 
-def test_a_row_says_where_the_belief_came_from() -> None:
+def test_a_row_names_the_estimator_of_the_belief() -> None:
     for changes, expected in (
         ({"observation": "frame"}, "none"),
         ({"observation": "local"}, "known_model"),
@@ -171,7 +171,7 @@ def test_a_row_says_where_the_belief_came_from() -> None:
         assert row.estimator == expected
 
 
-def test_a_summary_says_which_worlds_are_for_tests() -> None:
+def test_a_summary_counts_the_test_worlds() -> None:
     rows = score(seeds=[3, 5000], steps=2)
     assert summary(rows).endswith("a step on 2 (1 test) worlds")
     assert summary(rows[:1]).endswith(" a step on 1 test world, too few for a standard error")
@@ -204,7 +204,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 ]  # fmt: skip
 
 
-def test_what_cannot_be_evaluated_is_named() -> None:
+def test_wrong_evaluation_arguments_are_named() -> None:
     for changes, problem in WRONG:
         with refuses(problem):
             score(**changes)
@@ -212,7 +212,7 @@ def test_what_cannot_be_evaluated_is_named() -> None:
         evaluate(None, name="mine", **{**WORLDS, **SCALE})
 
 
-def test_without_hidden_states_the_other_figures_are_there(tmp_path: Path) -> None:
+def test_some_figures_need_no_hidden_states(tmp_path: Path) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
     whole, of_truth = score(), ("burning_seen_share", "front_distance")
     for flags in ({}, {"publish_truth": True, "reveal_model": False}):

@@ -147,7 +147,7 @@ DIFFERENT = {
     "functions of modules": (np.argmax, np.argmin),
     "models": (Learned(1.0), Learned(2.0)),
     "models within": (closing({"net": Learned(1.0)}), closing({"net": Learned(2.0)})),
-    "values that hold themselves": (circle(1), circle(2)),
+    "values that contain themselves": (circle(1), circle(2)),
     "keys": (closing({1: "a"}), closing({"1": "a"})),
 }
 
@@ -157,7 +157,7 @@ SAME = {
     "strides": (closing(np.arange(6)[::2]), closing(np.array([0, 2, 4]))),
     "lists and tuples": (closing([1, 2]), closing((1, 2))),
     "order of keys": (closing({"a": 1, "b": 2}), closing({"b": 2, "a": 1})),
-    "generators, which move on": (
+    "generators, which advance": (
         closing(np.random.default_rng(1)),
         closing(np.random.default_rng(2)),
     ),
@@ -165,12 +165,12 @@ SAME = {
     "queues": (closing(deque([1])), closing(deque([2]))),
     "optimizers": (Learned(1.0, 0.0), Learned(1.0, 9.0)),
     "locks": (closing(threading.Lock()), closing(threading.Lock())),
-    "what cannot be read": (Broken(1), Broken(2)),
-    "what is deeper than anybody looks": (deep(1), deep(2)),
+    "values that cannot be read": (Broken(1), Broken(2)),
+    "values nested beyond the limit": (deep(1), deep(2)),
 }
 
 
-def test_policies_have_one_digest_only_if_they_act_alike() -> None:
+def test_digests_are_equal_only_for_equal_policies() -> None:
     for name, pair in DIFFERENT.items():
         assert digest(pair[0]) != digest(pair[1]), name
         assert [digest(each) for each in pair] == [digest(each) for each in pair], name
@@ -178,7 +178,7 @@ def test_policies_have_one_digest_only_if_they_act_alike() -> None:
         assert digest(pair[0]) == digest(pair[1]), name
 
 
-def test_loggers_and_modules_count_by_their_names() -> None:
+def test_loggers_and_modules_are_hashed_by_name() -> None:
     def act(frames: Any) -> Any:
         logging.getLogger(__name__).debug(BIAS)
         return np.argmax(frames) + sys.maxsize
@@ -210,7 +210,7 @@ def test_a_digest_is_the_same_in_another_process(tmp_path: Path) -> None:
     assert len(set(runs)) == 1 and len(runs[0].strip()) == 16
 
 
-def test_tensors_count_by_values_and_networks_by_code_too() -> None:
+def test_tensors_are_hashed_by_value_and_networks_by_code() -> None:
     torch = pytest.importorskip("torch")
     for kind in (torch.float32, torch.bfloat16):
         weights = torch.ones(3, dtype=kind, requires_grad=True)

@@ -68,7 +68,7 @@ def calls_of(csv: object) -> int:
     return next(calls)
 
 
-def test_two_processes_that_write_to_one_file_lose_no_rows(tmp_path: Path) -> None:
+def test_two_processes_writing_one_file_lose_no_rows(tmp_path: Path) -> None:
     file = tmp_path / "rows.csv"
     writers = [script(WRITER, name, file, LIVELY) for name in ("first", "second")]
     for writer in writers:
@@ -77,7 +77,7 @@ def test_two_processes_that_write_to_one_file_lose_no_rows(tmp_path: Path) -> No
     assert Counter(row.policy for row in read(file)) == {"first": 20, "second": 20}
 
 
-def test_rows_that_come_meanwhile_are_kept_or_refused(tmp_path: Path) -> None:
+def test_rows_written_meanwhile_are_kept_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     first, second = opened(path), opened(path, mark=MARK._replace(policy_fingerprint="ef" * 8))
     first.add([row("mine", 0)])
@@ -100,7 +100,7 @@ def test_rows_that_come_meanwhile_are_kept_or_refused(tmp_path: Path) -> None:
     assert [row.policy for row in read(path)] == ["other"]
 
 
-def test_a_file_that_another_process_holds_is_named(
+def test_a_file_locked_by_another_process_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(row_file, "_PATIENCE", 0.1)
@@ -112,7 +112,7 @@ def test_a_file_that_another_process_holds_is_named(
     opened(path)
 
 
-def test_a_file_that_was_replaced_meanwhile_is_read_again(tmp_path: Path) -> None:
+def test_a_replaced_file_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     mine = opened(path)
     path.touch()
@@ -128,7 +128,7 @@ def test_a_file_that_was_replaced_meanwhile_is_read_again(tmp_path: Path) -> Non
     assert [row.policy for row in read(path)] == ["mine", "other"]
 
 
-def test_what_cannot_be_written_is_refused_before_the_policy_acts(tmp_path: Path) -> None:
+def test_unwritable_files_are_refused_before_the_policy_acts(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     os.mkfifo(tmp_path / "pipe")
     no_place_for_a_second = tmp_path / ("x" * 251 + ".csv")
@@ -138,7 +138,7 @@ def test_what_cannot_be_written_is_refused_before_the_policy_acts(tmp_path: Path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "pipe"]
 
 
-def test_a_full_disk_names_the_file_and_leaves_its_rows(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_keeps_old_rows(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     file = opened(path)
     file.add([row("mine", 0)])
@@ -168,7 +168,7 @@ def test_a_run_without_rows_leaves_no_file(tmp_path: Path) -> None:
     assert path.exists()
 
 
-def test_a_link_and_the_mode_of_a_file_stay(tmp_path: Path) -> None:
+def test_links_and_file_modes_are_preserved(tmp_path: Path) -> None:
     path, link = tmp_path / "rows.csv", tmp_path / "link.csv"
     path.touch(0o640)
     link.symlink_to(path)

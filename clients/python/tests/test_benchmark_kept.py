@@ -28,7 +28,7 @@ max_steps = {steps}
 test_seeds = {{ start = 3, end = 6 }}
 """
 
-#: Draws the actions of a world; digests of policies do not look into it.
+#: Draws the actions of a world; digests of policies do not include it.
 SHAPE: contextvars.ContextVar[tuple[int, ...]] = contextvars.ContextVar("SHAPE", default=())
 
 
@@ -49,7 +49,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "mine.csv"
 
 
-def test_rows_of_other_worlds_are_refused_by_name(file: Path) -> None:
+def test_rows_on_other_worlds_are_refused_by_name(file: Path) -> None:
     go(file)
     kept = file.read_bytes()
     changes: list[dict[str, Any]] = [{"n_moves": 5}, {"robots": 2}]
@@ -60,7 +60,7 @@ def test_rows_of_other_worlds_are_refused_by_name(file: Path) -> None:
     assert file.read_bytes() == kept
 
 
-#: Settings that make another policy, whose rows run again.
+#: Changes that count as another policy, whose rows are run again.
 CHANGED: list[dict[str, Any]] = [
     {"move": 1},
     {"deterministic": False},
@@ -71,7 +71,7 @@ CHANGED: list[dict[str, Any]] = [
 ]
 
 
-def test_another_policy_or_setting_runs_again_and_says_so(file: Path) -> None:
+def test_changed_policies_or_settings_are_run_again(file: Path) -> None:
     rows, _ = go(file)
     for change in CHANGED:
         token = SHAPE.set((4,) if "env" in change else ())
@@ -90,7 +90,7 @@ def test_another_policy_or_setting_runs_again_and_says_so(file: Path) -> None:
     assert again == rows and "3 rows kept" in said, "defaults that are named"
 
 
-def test_the_same_worlds_of_a_server_are_the_same_worlds(file: Path) -> None:
+def test_a_servers_equal_worlds_count_as_the_same(file: Path) -> None:
     rows, _ = go(file)
     flags = {"height": 7, "width": 9, "moves": 4, "model": LIVELY, "burn_in": 60}
     running = server(worlds=4, publish_truth=True, **flags)
@@ -105,14 +105,14 @@ def test_the_same_worlds_of_a_server_are_the_same_worlds(file: Path) -> None:
         evaluate(always(3), **keywords)
 
 
-def test_rows_of_a_changed_policy_leave_none_of_the_old_one(file: Path) -> None:
+def test_a_changed_policy_replaces_all_its_rows(file: Path) -> None:
     go(file)
     rows, said = go(file, 1, seeds=range(5, 7))
     assert "1 row already in" in said and "run again, 2 removed" in said
     assert read(file) == rows and [row.world_seed for row in rows] == [5, 6]
 
 
-def test_rows_of_other_steps_are_refused_by_name(file: Path) -> None:
+def test_rows_with_other_numbers_of_steps_are_refused(file: Path) -> None:
     go(file)
     with refuses("has steps 5 of 'mine' on world 3, expected 6: choose another"):
         go(file, steps=6)
@@ -129,7 +129,7 @@ def without_fingerprints(path: Path) -> None:
     path.write_text("".join(",".join(line.split(",")[:-3]) + "\n" for line in lines))
 
 
-def test_own_rows_of_an_older_release_are_refused_and_others_stay(file: Path) -> None:
+def test_own_rows_of_older_releases_are_refused(file: Path) -> None:
     go(file)
     without_fingerprints(file)
     assert [row.worlds_fingerprint for row in read(file)] == [""] * 3
@@ -144,7 +144,7 @@ def test_own_rows_of_an_older_release_are_refused_and_others_stay(file: Path) ->
     assert read(file) == old + rows
 
 
-def test_files_from_before_teams_and_figures_of_merit_are_read(file: Path) -> None:
+def test_files_of_older_releases_are_read(file: Path) -> None:
     head = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,"
     head += "mean_fire_cells,mean_plan_millis,brier,moves"
     file.write_text(f"{head}\nmine,none,3,5,1.5,4.0,0.5,7.0,0.1,,8\n")
@@ -153,14 +153,14 @@ def test_files_from_before_teams_and_figures_of_merit_are_read(file: Path) -> No
     assert row.recent_steps is None
 
 
-def test_a_file_that_spreadsheets_have_saved_is_read(file: Path) -> None:
+def test_a_file_saved_by_a_spreadsheet_is_read(file: Path) -> None:
     rows, _ = go(file)
     file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
     again, said = go(file)
     assert again == rows == read(file) and "3 rows kept" in said
 
 
-def test_a_row_of_other_values_is_refused(file: Path) -> None:
+def test_a_row_with_invalid_values_is_refused(file: Path) -> None:
     go(file)
     text = file.read_text()
     bad = ("mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20)
@@ -182,7 +182,7 @@ def run_suite(folder: Path, move: int = 3, **changes: Any) -> tuple[list[Row], s
     return rows["lab"], said.getvalue()
 
 
-def test_a_suite_keeps_rows_and_runs_again_what_has_changed(tmp_path: Path) -> None:
+def test_a_suite_reuses_rows_and_reruns_changed_ones(tmp_path: Path) -> None:
     rows, _ = run_suite(tmp_path)
     again, said = run_suite(tmp_path)
     assert again == rows and "mine: 3 rows kept in " in said
@@ -192,7 +192,7 @@ def test_a_suite_keeps_rows_and_runs_again_what_has_changed(tmp_path: Path) -> N
         assert read(tmp_path / "out" / "lab.csv") == rows != first
 
 
-def test_a_suite_leaves_rows_of_other_policies_on_older_worlds(tmp_path: Path) -> None:
+def test_a_suite_keeps_other_policies_rows_on_old_worlds(tmp_path: Path) -> None:
     file = tmp_path / "out" / "lab.csv"
     old, _ = run_suite(tmp_path, name="old")
     with pytest.warns(UserWarning, match="lab.csv has rows of old on other worlds") as warned:
@@ -208,13 +208,13 @@ def test_a_suite_leaves_rows_of_other_policies_on_older_worlds(tmp_path: Path) -
     assert "3 rows already in" in said
 
 
-def test_a_suite_has_one_task_of_each_name(tmp_path: Path) -> None:
+def test_a_suite_refuses_tasks_with_equal_names(tmp_path: Path) -> None:
     with refuses("tasks: expected tasks with different names, got small, small"):
         suite(always(3), name="mine", folder=tmp_path, tasks=["small", "small"])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_worlds_that_change_meanwhile_are_refused(file: Path, tmp_path: Path) -> None:
+def test_worlds_that_change_during_a_run_are_refused(file: Path, tmp_path: Path) -> None:
     model = tmp_path / "model.toml"
     text = Path(LIVELY).read_text()
     model.write_text(text)

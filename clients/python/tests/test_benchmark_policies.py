@@ -68,7 +68,7 @@ class Forwarding(Recurrent):
         return super().predict(seen, **others)
 
 
-def test_models_and_functions_get_their_state_back() -> None:
+def test_models_and_functions_receive_their_state() -> None:
     for kind in (Recurrent, Older, Short, Forwarding):
         model = kind()
         go(model, batch=2)
@@ -91,7 +91,7 @@ def test_models_and_functions_get_their_state_back() -> None:
 
 @pytest.mark.parametrize("n_worlds", [1, 2, 3])
 @pytest.mark.parametrize("env", [MOVES, WILDFIRE])
-def test_actions_are_taken_in_any_form_without_a_state(env: str, n_worlds: int) -> None:
+def test_actions_are_accepted_in_any_form(env: str, n_worlds: int) -> None:
     shape = (n_worlds,) if env == MOVES else (n_worlds, N_MOVES)
     ones, options = np.ones(shape, int), {"env": env, "seeds": range(3, 3 + n_worlds)}
     whole = [row.mean_reward for row in go(lambda _: ones, **options)]
@@ -108,7 +108,7 @@ def test_actions_are_taken_in_any_form_without_a_state(env: str, n_worlds: int) 
             assert [row.mean_reward for row in go(policy, **options)] == whole
 
 
-def test_the_first_parameter_is_the_observation_whatever_its_name() -> None:
+def test_the_first_parameter_is_the_observation() -> None:
     def act(state: Any, mask: Any = None) -> Any:
         assert state.shape == (3, 7, 9, 1) and mask is None
         return np.zeros(len(state), int)
@@ -117,7 +117,7 @@ def test_the_first_parameter_is_the_observation_whatever_its_name() -> None:
     go(type("Named", (), {"predict": lambda self, state, mask=None: act(state, mask)})())
 
 
-def test_what_is_no_action_is_named() -> None:
+def test_invalid_actions_are_named() -> None:
     for outcome, problem in (
         ((np.ones(3, int), np.zeros(3)), "policy: it returns a state with its actions, but has"),
         (([1, 2], [1, 2, 3]), "policy: expected actions, got tuple: "),
@@ -154,7 +154,7 @@ class Masked:
         return np.argmax(action_masks, axis=1), None
 
 
-def test_models_and_functions_get_masks(walled: Path) -> None:
+def test_models_and_functions_receive_masks(walled: Path) -> None:
     model, masks = Masked(), []
 
     def act(frames: Any, action_masks: NDArray[np.bool_]) -> Any:
@@ -197,7 +197,7 @@ class Normalized:
         return np.zeros(len(seen), int), None
 
 
-def test_a_model_sees_normalized_observations_by_which_it_is_known(
+def test_normalization_applies_and_identifies_the_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for observation in ("local", "frame"):
@@ -212,7 +212,7 @@ def test_a_model_sees_normalized_observations_by_which_it_is_known(
 FRAME = spaces.Box(0, 255, (7, 9, 1), np.uint8)
 
 
-def test_a_model_of_other_observations_is_refused() -> None:
+def test_a_model_for_other_observations_is_refused() -> None:
     model: Any = Recurrent()
     for space, words in (
         (spaces.Box(0, 255, (7, 9, 4), np.uint8), r"wrap=, such as lambda worlds: VecFrameStack\("),
@@ -230,7 +230,7 @@ def test_a_model_of_other_observations_is_refused() -> None:
         go(model)
 
 
-def test_a_policy_hears_of_other_worlds() -> None:
+def test_a_policy_is_told_when_new_worlds_begin() -> None:
     begun: list[int] = []
 
     class Begun(Recurrent):
@@ -241,7 +241,7 @@ def test_a_policy_hears_of_other_worlds() -> None:
     assert begun == [2, 1]
 
 
-def test_wrapping_without_the_trainer_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_stable_baselines_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
         monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delitem(sys.modules, "emberwatch.benchmark.wrapped", raising=False)

@@ -128,7 +128,7 @@ def normalized(worlds: Any) -> Any:
 
 
 @pytest.mark.parametrize("parts", ["local", ("frame", "local")], ids=str)
-def test_a_model_behind_vec_normalize_scores_as_in_its_own(
+def test_a_model_with_vec_normalize_scores_as_in_its_own(
     world: dict[str, Any], parts: Any, tmp_path: Path
 ) -> None:
     policy = "MlpPolicy" if isinstance(parts, str) else "MultiInputPolicy"
@@ -170,7 +170,7 @@ def vars_of(statistics: Any) -> Any:
     return vars(statistics)
 
 
-def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
+def test_masks_pass_through_wrappers(world: dict[str, Any]) -> None:
     def stack(worlds: Any) -> Any:
         return VecFrameStack(worlds, 2)
 
@@ -180,7 +180,7 @@ def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
     check(model, expected, world, wrap=stack)
 
 
-def test_functions_see_what_wrappers_show(world: dict[str, Any]) -> None:
+def test_functions_receive_wrapped_observations(world: dict[str, Any]) -> None:
     shapes = set()
 
     def act(seen: Any) -> Any:

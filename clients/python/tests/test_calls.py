@@ -42,7 +42,7 @@ def test_every_call_has_a_timeout() -> None:
     assert client.observe(timeout=float("inf")).result().world.step == 0
 
 
-def test_a_signal_that_is_handled_does_not_end_a_step() -> None:
+def test_a_handled_signal_does_not_end_a_step() -> None:
     started = server()
     lease = started.connect().acquire()
     caught: list[int] = []
@@ -67,7 +67,7 @@ def test_a_signal_that_is_handled_does_not_end_a_step() -> None:
     assert len(caught) == 5
 
 
-def test_closing_again_is_fine_and_a_closed_client_says_so() -> None:
+def test_closing_twice_is_allowed_and_closed_clients_refuse() -> None:
     client = server().connect()
     lease = client.acquire()
     for _ in range(3):
@@ -111,12 +111,12 @@ print("child", process.exitcode)
 """
 
 
-def test_a_forked_child_is_refused_and_its_parent_goes_on() -> None:
+def test_a_forked_child_is_refused_and_its_parent_continues() -> None:
     ended, out, err = script(FORK, server().instance).end()
     assert (ended, out) == (0, "child 0\n"), err
 
 
-def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on() -> None:
+def test_ctrl_c_ends_a_blocked_step_but_not_the_client() -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()

@@ -24,7 +24,7 @@ def paths(n_worlds: int, seed: int = 0) -> NDArray[np.int64]:
     return np.random.default_rng(seed).integers(0, 4, (n_worlds, 6))
 
 
-def test_a_handshake_tells_what_the_server_is() -> None:
+def test_a_handshake_describes_the_server() -> None:
     settings = {"worlds": 3, "max_steps": 9, "coverage": "client", "lease_millis": 1234}
     started = server(**settings, publish_truth=True)
     info = connect(started.instance).info
@@ -69,14 +69,14 @@ def test_a_released_world_is_free() -> None:
     assert started.status().worlds[0].holder_pids[0] is None
 
 
-def test_leaving_a_with_keeps_the_first_error() -> None:
+def test_leaving_a_with_block_keeps_the_first_error() -> None:
     started = server()
     with pytest.raises(ZeroDivisionError), started.connect() as client, client.acquire():
         client.close()
         raise ZeroDivisionError
 
 
-def test_the_version_is_that_of_the_programs() -> None:
+def test_the_version_matches_the_programs() -> None:
     said = subprocess.run([find("emberwatch-server"), "--version"], capture_output=True, text=True)
     assert said.stdout.split() == ["emberwatch-server", emberwatch.__version__]
 
@@ -101,7 +101,7 @@ WRONG_PAIRS = [
 ]
 
 
-def test_wrong_calls_of_a_lease_are_named_and_never_sent() -> None:
+def test_wrong_calls_of_a_lease_are_refused_and_not_sent() -> None:
     started = server(worlds=4)
     one, two = started.connect().acquire(0), started.connect().acquire(1, 2)
     rows: list[tuple[Callable[..., Any], Any, str]] = []
@@ -122,7 +122,7 @@ def test_wrong_calls_of_a_lease_are_named_and_never_sent() -> None:
     assert one.step([3] * 6).result().world.step == 1
 
 
-def test_a_forgotten_client_leaves_no_descriptor() -> None:
+def test_a_garbage_collected_client_leaks_no_descriptor() -> None:
     started = server()
 
     def n_open() -> int:

@@ -9,7 +9,7 @@ from emberwatch.errors import EmberwatchError
 PYTHON = Path(__file__).parents[1]
 
 
-def test_the_documented_codes_are_those_of_the_code() -> None:
+def test_the_documented_error_codes_match_the_code() -> None:
     page = (PYTHON / "README.md").read_text("utf-8")
     table = page.split("| exception | when |")[1].split("\n\n")[0]
     cells = [line.split("|")[1] for line in table.splitlines() if line.count("|") > 2]

@@ -49,7 +49,7 @@ def apart() -> Run:
     return python
 
 
-def test_a_full_shared_memory_kills_no_server_with_observers(apart: Run) -> None:
+def test_full_shared_memory_does_not_end_an_observed_server(apart: Run) -> None:
     code = """
 server, client = start("--worlds=8", "--publish-truth=true", "--burn-in=5")
 lease = client.acquire(0, 8)
@@ -72,7 +72,7 @@ print(lease.reset(range(8))[0].step, server.pid == client.status().pid)
     assert lines[8:] == ["0 True"], ended
 
 
-def test_an_observer_that_comes_to_a_full_server_harms_nobody(apart: Run) -> None:
+def test_an_observer_may_join_when_shared_memory_is_full(apart: Run) -> None:
     code = """
 server, client = start("--height=200", "--width=200", "--burn-in=0", "--moves=6")
 lease = client.acquire()
@@ -88,7 +88,7 @@ print(next(iter(observer)).result.step)
     assert (ended.returncode, ended.stdout) == (0, "200 True\n201\n"), ended
 
 
-def test_a_long_answer_without_room_is_refused_and_kills_no_server(apart: Run) -> None:
+def test_an_answer_without_memory_is_refused(apart: Run) -> None:
     code = """
 small = ("--height=5", "--width=5", "--moves=4", "--burn-in=0")
 server, client = start("--worlds=256", "--robots=8", *small)
@@ -103,7 +103,7 @@ print(len(client.status().worlds))
     assert n_worlds == "256", ended
 
 
-def test_a_low_limit_on_file_sizes_is_called_so() -> None:
+def test_a_low_limit_on_file_sizes_is_named() -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     started = server()
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))

@@ -60,7 +60,7 @@ MODES, SHAPES = (None, "human", "rgb_array", "ansi"), ("Env", "VectorEnv")
     ],
     ids=str,
 )
-def test_gymnasium_finds_no_fault(name: str, keywords: dict[str, Any]) -> None:
+def test_the_environment_checker_passes(name: str, keywords: dict[str, Any]) -> None:
     with no_warnings():
         env = make(name, **keywords)
         for transition in rollout(env, 30, seed=1):
@@ -74,10 +74,10 @@ def test_gymnasium_finds_no_fault(name: str, keywords: dict[str, Any]) -> None:
         check_env(env.unwrapped, skip_render_check=keywords.get("render_mode") is None)
 
 
-def test_gymnasium_finds_no_fault_in_an_attached_one() -> None:
+def test_the_environment_checker_passes_on_a_server() -> None:
     with serving() as instance, no_warnings():
         env = make(instance=instance)
-        # The check keeps several environments of one id, but a server's world has one holder.
+        # The check would make more environments of this id, but a world has only one holder.
         env.unwrapped.spec = None
         check_env(env.unwrapped, skip_render_check=True)
 
@@ -104,7 +104,7 @@ def test_ages_count_the_steps_since_a_cell_was_seen() -> None:
     assert (env.reset()[0]["age"] == 255).all()
 
 
-def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_truth_survives_many_samples_of_other_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
     with (
         serving(worlds=41, publish_truth=True) as instance,
         emberwatch.connect(instance) as client,
@@ -128,7 +128,7 @@ def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPa
             assert_same(env.step(action), alone.step(action))
 
 
-def test_episodes_follow_their_seed_and_are_random_without_one() -> None:
+def test_episodes_repeat_by_seed_and_differ_without_one() -> None:
     env, other = make(truth=True), make(truth=True)
     env.reset(seed=5)
     assert_same(env.reset(seed=0), other.reset(seed=0))
@@ -151,7 +151,7 @@ def test_an_episode_is_truncated_after_max_episode_steps() -> None:
 
 
 @pytest.mark.parametrize(("name", "n_actions"), [(WILDFIRE, 1), (MOVES, 4)])
-def test_a_server_may_truncate_earlier(name: str, n_actions: int) -> None:
+def test_a_server_can_truncate_earlier(name: str, n_actions: int) -> None:
     with serving(max_steps=2) as instance:
         env = make(name, instance=instance)
         ends = [transition[2:4] for transition in rollout(env, 2 * n_actions, seed=1)[1:]]
@@ -165,7 +165,7 @@ def test_a_server_may_truncate_earlier(name: str, n_actions: int) -> None:
         assert [env.step(action)[4]["step"] for action in (*path, last)][-1] == 1
 
 
-def test_resume_goes_on_where_another_agent_stopped() -> None:
+def test_resume_continues_another_agents_episode() -> None:
     with serving() as instance:
         command = [find("emberwatch-agent"), "run", "--instance", instance]
         command += ["--steps", "5", "--policy", "random_walk"]
@@ -204,7 +204,7 @@ IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
     ({"takeover": 1}, "takeover: expected bool, got 1"),
     ({"instance": 5}, r"instance: expected str \| None, got 5"),
     ({"model": 5}, r"model: expected str \| Path \| None, got 5"),
-    ({"model": "nowhere.toml"}, r"model file nowhere\.toml: No such file .*expected one, or "),
+    ({"model": "nowhere.toml"}, r"model file nowhere\.toml: No such .*expected a file, or one of "),
     ({"timeout": None}, "timeout: expected float, got None"),
     *(
         ({"timeout": it}, f"timeout: expected seconds above 0, got {it}")
@@ -248,7 +248,7 @@ OTHER_THAN_SERVED: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_impossible_keywords_are_named_when_it_is_made() -> None:
+def test_invalid_keywords_are_named_at_construction() -> None:
     for keywords, words in IMPOSSIBLE:
         with refuses(words) as raised:
             make(**keywords)
@@ -283,7 +283,7 @@ def test_an_unknown_keyword_is_named() -> None:
         assert ("checkpoint" in str(raised.value)) == (name == OBJECTIVE)
 
 
-def test_keywords_beside_an_instance_agree_with_the_server() -> None:
+def test_keywords_must_match_the_server() -> None:
     with serving(worlds=2) as lab:
         for keywords, words in OTHER_THAN_SERVED:
             with refuses(words):
@@ -303,7 +303,7 @@ def test_keywords_beside_an_instance_agree_with_the_server() -> None:
         assert env.render()
 
 
-def test_worlds_without_rewards_are_warned_of(tmp_path: Path) -> None:
+def test_worlds_without_rewards_cause_a_warning(tmp_path: Path) -> None:
     model = tmp_path / "model.toml"
     model.write_text(Path(LIVELY).read_text().replace("reward = 1.0", "reward = 0.0"))
     for making in (gymnasium.make, gymnasium.make_vec):
@@ -334,7 +334,7 @@ def test_a_second_environment_on_a_world_names_the_holder() -> None:
         assert second.reset(options={"resume": True})[1]["step"] == 1
 
 
-def test_takeover_takes_the_world_and_its_step() -> None:
+def test_takeover_continues_at_the_worlds_step() -> None:
     with serving() as instance:
         loser = make(instance=instance)
         winner = make(instance=instance, takeover=True)
@@ -359,7 +359,7 @@ def test_takeover_takes_the_world_and_its_step() -> None:
         assert loser.reset(seed=3)[1]["step"] == 0
 
 
-def test_another_server_of_other_worlds_is_refused() -> None:
+def test_a_new_server_with_other_worlds_is_refused() -> None:
     with serving() as instance:
         env = make(instance=instance)
         env.reset()
@@ -431,7 +431,7 @@ def test_pictures_are_drawn_in_each_mode() -> None:
 
 
 @pytest.mark.parametrize("making", [make, partial(make_vec, 2)])
-def test_without_a_render_mode_nothing_is_drawn_with_a_word(making: Any) -> None:
+def test_rendering_without_a_mode_warns(making: Any) -> None:
     env = making().unwrapped
     env.reset(seed=1)
     with pytest.warns(UserWarning, match="nothing to draw; give a render_mode"):

@@ -100,7 +100,7 @@ def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArra
 
 
 @pytest.mark.parametrize(("kind", "checkpoint"), CASES)
-def test_beliefs_are_the_agents_to_the_bit(
+def test_beliefs_equal_the_agents_bit_for_bit(
     kind: str, checkpoint: str | None, checkpoints: Path, flown: Any
 ) -> None:
     path = checkpoints / checkpoint if checkpoint else None
@@ -121,7 +121,7 @@ def test_beliefs_are_the_agents_to_the_bit(
 
 
 @pytest.mark.parametrize("kind", KNOWN)
-def test_some_worlds_move_and_begin_again(kind: str, flown: Any) -> None:
+def test_worlds_can_move_and_reset_separately(kind: str, flown: Any) -> None:
     kept, fresh = made(kind, None, N_WORLDS), made(kind, None)
     first = kept.belief
     for _, frames, _ in flown[1:4]:
@@ -175,7 +175,7 @@ def test_scores_follow_their_definition(n_worlds: int | None, flown: Any) -> Non
     assert (repeated.log_loss == scores.log_loss).all(), "it begins again"
 
 
-def test_certainty_that_is_wrong_costs_infinitely_much() -> None:
+def test_wrong_certainty_has_infinite_loss() -> None:
     prior = np.zeros((3, 1, 2))
     prior[0] = 1
     kept = belief.known(MODEL, prior=prior)
@@ -256,7 +256,7 @@ REFUSALS: list[tuple[int | None, Callable[[Belief], Any], str]] = [
 ]  # fmt: skip
 
 
-def test_a_refused_call_leaves_the_belief_as_it_was() -> None:
+def test_a_refused_call_does_not_change_the_belief() -> None:
     for n_worlds, call, error in REFUSALS:
         kept = made("known", None, n_worlds)
         kept.correct(np.full(kept.shape, 2, np.uint8))
@@ -286,13 +286,13 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
             belief.load(checkpoints / name, **GRID, model=ringed)
 
 
-def test_a_neural_belief_with_a_known_sensor_weighs_what_it_sees(checkpoints: Path) -> None:
+def test_a_neural_belief_can_use_a_known_sensor(checkpoints: Path) -> None:
     def neural(**keywords: Any) -> Belief:
         return belief.load(checkpoints / "neural_belief", **GRID, **keywords)
 
     plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
     shows = MODEL.observation_matrix.T
-    # Except where the inverse of the sensor returns a negative probability, which is clamped.
+    # Except where the inverse of the sensor yields a negative probability, which is clamped.
     possible = (noisy.belief > 1e-5).all(0)
     shown = np.tensordot(shows, noisy.belief, 1)
     assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)
@@ -328,7 +328,7 @@ def test_an_impossible_frame_names_its_world() -> None:
     assert (one.belief == prior).all()
 
 
-def test_an_autoencoder_knows_only_its_grid(tmp_path: Path) -> None:
+def test_an_autoencoder_works_only_on_its_grid(tmp_path: Path) -> None:
     settings = tmp_path / "agent.toml"
     settings.write_text("[autoencoder]\nwindow = 2\n")
     command = [find("emberwatch-agent"), "train", "--learner=autoencoder", "--height=8"]
@@ -346,7 +346,7 @@ def test_an_autoencoder_knows_only_its_grid(tmp_path: Path) -> None:
             belief.load(checkpoint, **GRID, model=model)
 
 
-def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_readme_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     page = Path(__file__).parents[1].joinpath("README.md").read_text("utf-8")
     section = page.split("## Beliefs\n")[1].split("\n## ")[0]
     lines = [line for line in section.splitlines() if line.startswith("    ") or not line]
@@ -356,7 +356,7 @@ def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.mark.parametrize("name", ["wildfire-burnout", "road-ice", "wildfire-terrain"])
-def test_every_kind_takes_models_of_any_form(name: str) -> None:
+def test_every_kind_accepts_models_in_any_form(name: str) -> None:
     model = Model.named(name)
     height, width = (
         (64, 64) if model.zones is not None or model.airspace.no_fly is not None else (5, 4)

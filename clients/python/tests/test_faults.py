@@ -53,7 +53,7 @@ def check_kill(started: Server, call: Callable[[], object]) -> None:
     killer.join()
 
 
-def test_a_server_killed_during_a_call_is_gone() -> None:
+def test_killing_the_server_raises_server_gone() -> None:
     for what in ("step", "control", "handshake"):
         started = server()
         client = started.connect()
@@ -83,7 +83,7 @@ class Remains:
 
 
 @pytest.mark.parametrize("end", ENDS, ids=lambda it: str(it).partition(";")[0] or "normal")
-def test_a_learner_ends_in_any_way_and_leaves_nothing(end: str | signal.Signals) -> None:
+def test_a_learner_leaves_nothing_however_it_ends(end: str | signal.Signals) -> None:
     started, by_itself = server(), isinstance(end, str)
     for instance in ([], [started.instance]):
         rest = f"input()\n{end}" if by_itself else "while True: env.step([1] * 6)"

@@ -140,7 +140,7 @@ def test_panels_show_truth_frame_belief_and_entropy(studio: Studio) -> None:
     assert (np.array(robot) == 0x14).all()
 
 
-def test_a_film_shows_each_step_and_a_still_one_of_them(studio: Studio) -> None:
+def test_a_film_shows_all_steps_and_a_still_one(studio: Studio) -> None:
     records = [server(), *both(0, 1, 2, 3, 4)]
     assert studio.film(records, "--fps", 20) == ""
     assert studio.millis() == [50] * 4 + [1000]
@@ -153,7 +153,7 @@ def test_a_film_shows_each_step_and_a_still_one_of_them(studio: Studio) -> None:
         assert np.abs(cells(still, panel).astype(int) - cells(first, panel)).max() <= 4
 
 
-def test_the_belief_goes_through_gaps_which_are_shown_and_told(studio: Studio) -> None:
+def test_the_belief_predicts_through_visible_gaps(studio: Studio) -> None:
     records = [server(), *both(0, 1, 4, 5)]
     words = studio.film(records)
     assert "2 steps are not recorded; the belief is predicted through them" in words
@@ -171,7 +171,7 @@ def test_the_belief_goes_through_gaps_which_are_shown_and_told(studio: Studio) -
     assert studio.millis() == [100, 1000, 1000], "a gap is not left out"
 
 
-def test_the_belief_begins_again_with_an_episode(studio: Studio) -> None:
+def test_the_belief_resets_with_a_new_episode(studio: Studio) -> None:
     records = [server(), *both(0, 1), frame(0, episode=1)]
     words = studio.film(records, "--step", 0)
     assert "--step: recorded in 2 episodes; showing the first" in words
@@ -182,7 +182,7 @@ def test_the_belief_begins_again_with_an_episode(studio: Studio) -> None:
     assert (lacking[0] == 255).all(), "no hidden states of that step"
 
 
-def test_what_is_not_recorded_is_left_out(studio: Studio) -> None:
+def test_missing_parts_are_left_out(studio: Studio) -> None:
     whole = studio.still([server(), *both(1)])
     blind = studio.still([server(), frame(1)])
     assert whole.shape[1] - blind.shape[1] == 166, "no panel of hidden states"
@@ -191,7 +191,7 @@ def test_what_is_not_recorded_is_left_out(studio: Studio) -> None:
     assert studio.pictures()[0].shape[1] == 2 * 150 + 16 + 28
 
 
-def test_a_hidden_model_is_given(studio: Studio, tmp_path: Path) -> None:
+def test_a_hidden_model_can_be_passed_by_flag(studio: Studio, tmp_path: Path) -> None:
     file = tmp_path / "model.toml"
     file.write_text(MODEL.toml)
     plain, given = ([server(**it), *both(1)] for it in ({}, {"model": None}))
@@ -217,7 +217,7 @@ def test_recorded_worlds_have_the_colours_of_their_description(studio: Studio) -
     assert (cells(image, 1)[seen] == colors[SEEN[seen]]).all()
 
 
-def test_cut_changed_and_repeated_records_are_shown_once(studio: Studio) -> None:
+def test_a_film_skips_other_worlds_and_repeated_records(studio: Studio) -> None:
     words = studio.film([server(), frame(0), frame(1), frame(2)], cut=True)
     assert "warning" in words and "cut short" in words
     assert len(studio.millis()) == 2
@@ -253,7 +253,7 @@ def test_wrong_flags_are_named(studio: Studio) -> None:
     assert not studio.gif.exists() and not studio.png.exists()
 
 
-def test_recordings_that_make_no_sense_are_named(studio: Studio) -> None:
+def test_invalid_recordings_are_named(studio: Studio) -> None:
     assert "at byte 16" in studio.fails([b"\0" * 40])
     always = [("[0.98, 0.01, 0.01]", "[1, 0, 0]"), ("[0.80, 0.15, 0.05]", "[1, 0, 0]")]
     toml = MODEL.toml.replace("[0.01, 0.01, 0.98]", "[0, 1, 0]")
@@ -262,15 +262,13 @@ def test_recordings_that_make_no_sense_are_named(studio: Studio) -> None:
     assert "step 0: frame: cell (1, 1): expected" in studio.fails([server(model=toml), frame(0)])
 
 
-def test_without_pillow_it_says_what_to_install(
-    studio: Studio, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_pillow_names_the_extra(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "emberwatch.render.film.page", raising=False)
     monkeypatch.setitem(sys.modules, "PIL", None)
     assert "pip install emberwatch[film]" in studio.fails([server(), frame(0)])
 
 
-def test_a_team_is_drawn_with_its_paths_and_who_stayed_is_told(studio: Studio) -> None:
+def test_a_team_is_drawn_with_paths_and_hovering_robots(studio: Studio) -> None:
     team = server(n_robots=3)
     blank = studio.still([team, frame(1, robots=3, hovered=7)])
     flown = studio.still([team, frame(1, robots=3, hovered=0)])
@@ -288,7 +286,7 @@ def test_a_team_is_drawn_with_its_paths_and_who_stayed_is_told(studio: Studio) -
     assert foot["flown"] < foot["some"] < foot["blank"]
 
 
-def test_zones_no_fly_cells_and_footprints_are_drawn_and_told(studio: Studio) -> None:
+def test_zones_no_fly_cells_and_footprints_are_drawn(studio: Studio) -> None:
     zone_map = [[0] * WIDTH, [0] * WIDTH, [1] * WIDTH]
     zones = {"names": ["grass", "town"], "colors": ["#00ff00", "#ff00ff"], "map": zone_map}
     no_fly = [[0, 0, 0, 0, 1]] * HEIGHT

@@ -101,7 +101,7 @@ print("done")
 """
 
 
-def test_neither_shared_memory_nor_programs_are_needed() -> None:
+def test_in_process_worlds_need_no_shared_memory_or_programs() -> None:
     run = isolated("ro")
     ended = run("env", "PATH=", sys.executable, "-c", ALONE)
     assert (ended.returncode, ended.stdout) == (0, "done\n"), ended.stderr
@@ -135,7 +135,7 @@ def action(env: Any) -> Any:
 
 @pytest.mark.parametrize("kind", MAKERS)
 @pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
-def test_a_forked_child_is_refused_the_episode_and_may_reset(kind: str) -> None:
+def test_a_forked_child_must_reset_first(kind: str) -> None:
     env, unopened = MAKERS[kind](), MAKERS[kind]()
     n_moves = SMALL["n_moves"] if kind in ("moves", "team") else 1  # until the worlds move
     first = env.reset(seed=4)
@@ -164,9 +164,7 @@ def test_a_forked_child_is_refused_the_episode_and_may_reset(kind: str) -> None:
     assert_same([unopened.reset(seed=4), unopened.step(action(env))], [first, expected[0]])
 
 
-def test_snapshots_and_forks_are_those_of_a_server(
-    client: emberwatch.Client, tmp_path: Path
-) -> None:
+def test_snapshots_and_forks_equal_a_servers(client: emberwatch.Client, tmp_path: Path) -> None:
     other = small_server(worlds=2).connect()
     path, seen = tmp_path / "worlds", list[Any]()
     for at in (client, other):
@@ -221,7 +219,7 @@ def test_wrong_settings_are_refused(client: emberwatch.Client) -> None:
             emberwatch.embed(**settings)
 
 
-def test_settings_of_a_pipe_are_not_waited_for_without_end(tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_read_of_a_model_from_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(fifo := tmp_path / "model.toml")
     started = script(
         f"import emberwatch; print(1, flush=True); emberwatch.embed(model={str(fifo)!r})"
@@ -233,7 +231,7 @@ def test_settings_of_a_pipe_are_not_waited_for_without_end(tmp_path: Path) -> No
     assert "KeyboardInterrupt" in err
 
 
-def test_a_step_does_not_wait_for_the_burn_ins_of_others() -> None:
+def test_a_step_does_not_wait_for_other_worlds_burn_ins() -> None:
     large = {"height": 512, "width": 512, "burn_in": 4000, "worlds": 3, "threads": 1}
     with emberwatch.embed(**large, moves=4) as client:
         client.acquire(0).step([3] * 4)

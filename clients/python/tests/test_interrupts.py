@@ -124,7 +124,7 @@ def begun(env: Any, n_steps: int = 3, seed: int = 1000) -> Any:
     return env
 
 
-def test_a_step_that_was_interrupted_is_never_taken_for_the_next(pair: tuple[Any, Any]) -> None:
+def test_an_interrupted_step_is_never_mistaken_for_the_next(pair: tuple[Any, Any]) -> None:
     env, other = pair
     first, second = action(env, 10), action(env, 11)
     begun(other)
@@ -146,7 +146,7 @@ def test_a_step_that_was_interrupted_is_never_taken_for_the_next(pair: tuple[Any
     assert n_refused > 4  # of up to 25: waits poll at different rates
 
 
-def test_a_reset_that_was_interrupted_is_followed_by_any_other(pair: tuple[Any, Any]) -> None:
+def test_any_reset_may_follow_an_interrupted_one(pair: tuple[Any, Any]) -> None:
     env, other = pair
     first = action(env, 10)
     begun(other)
@@ -184,7 +184,7 @@ def same(left: object, right: object) -> bool:
     return True
 
 
-def test_a_close_that_was_interrupted_is_closed_again() -> None:
+def test_an_interrupted_close_can_be_repeated() -> None:
     kept, started = [], small_server(publish_truth=True)
     for n in (1, 5, 20, 40, 80, 160):
         env = begun(make(instance=started.instance, truth=True))
@@ -193,7 +193,7 @@ def test_a_close_that_was_interrupted_is_closed_again() -> None:
         assert eventually(lambda: started.status().worlds[0].holder_pids == (None,))
 
 
-def test_an_unfinished_step_asks_for_a_reset_of_all_worlds() -> None:
+def test_an_unfinished_step_requires_a_full_reset() -> None:
     envs = begun(make_vec(3, autoreset_mode="Disabled"))
     actions = action(envs, 1)
     assert interrupted(lambda: envs.step(actions), 20)
@@ -206,7 +206,7 @@ def test_an_unfinished_step_asks_for_a_reset_of_all_worlds() -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), [(WILDFIRE, 5), (OBJECTIVE, None)])
-def test_a_reset_waits_for_the_one_that_was_interrupted(name: str, seed: int | None) -> None:
+def test_a_reset_waits_for_an_interrupted_one(name: str, seed: int | None) -> None:
     started = server(burn_in=1_500_000)  # takes longer than the timeout below
     env = make(name, instance=started.instance)
     env.reset(seed=1)
@@ -219,7 +219,7 @@ def test_a_reset_waits_for_the_one_that_was_interrupted(name: str, seed: int | N
     assert env.step(first)[4]["step"] == 1
 
 
-def test_a_path_that_waits_for_others_is_taken_back_by_ctrl_c() -> None:
+def test_ctrl_c_withdraws_a_path_that_waits_for_teammates() -> None:
     started = server(robots=2)
     env = closed_later(emberwatch.WildfireEnv(instance=started.instance, robot=0))
     env.reset()

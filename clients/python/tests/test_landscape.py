@@ -23,7 +23,7 @@ ARRIVALS = ("--kind", "arrival", *STEP, "--burning", "2")
 MINUTES = (*ARRIVALS, "--unit", "min")
 MASKS = ("--kind", "mask", *STEP, "--burning", "2")
 STATES = ("--kind", "states", *STEP)
-#: The first step, of 10 minutes each, in which each cell burns: 35 minutes have passed in step 4.
+#: The first 10-minute step that shows each cell burning: step 4 for an arrival at 35 minutes.
 BEGIN = np.where(ARRIVAL == NEVER, 99, np.ceil(ARRIVAL / 10))
 #: The states of all six steps, in which a cell burns for two steps.
 FIRE = np.array([(BEGIN <= k) + (BEGIN + 2 <= k).astype(int) for k in range(6)], np.uint8)
@@ -96,7 +96,7 @@ def same_arrivals(f: Path) -> list[tuple[object, ...]]:
     return files
 
 
-def test_arrival_times_are_the_same_however_they_are_written(tmp_path: Path, out: Path) -> None:
+def test_arrival_times_do_not_depend_on_the_format(tmp_path: Path, out: Path) -> None:
     for file, *flags in same_arrivals(tmp_path):
         np.testing.assert_array_equal(one(out, file, *ARRIVALS, *flags), FIRE, str(file))
 
@@ -114,7 +114,7 @@ def test_rows_run_from_the_north_and_columns_from_the_west(tmp_path: Path, out: 
         np.testing.assert_array_equal(part, FIRE[: len(part), :2, 1:])
 
 
-def test_what_burns_before_the_begin_burns_from_step_0(tmp_path: Path, out: Path) -> None:
+def test_earlier_arrivals_burn_from_step_0(tmp_path: Path, out: Path) -> None:
     file = geotiff(tmp_path / "fire.tif", np.where(ARRIVAL == 0, -2147.5, ARRIVAL))
     np.testing.assert_array_equal(one(out, file, *MINUTES, "--begin", 0), FIRE)
     burns = np.where(ARRIVAL == NEVER, 99, np.where(ARRIVAL <= 20, 0, BEGIN - 2))
@@ -122,7 +122,7 @@ def test_what_burns_before_the_begin_burns_from_step_0(tmp_path: Path, out: Path
     np.testing.assert_array_equal(one(out, file, *MINUTES, "--begin", 20), expected)
 
 
-def test_each_file_of_arrivals_or_folder_of_layers_is_a_sequence(tmp_path: Path, out: Path) -> None:
+def test_each_arrival_file_or_layer_folder_is_a_sequence(tmp_path: Path, out: Path) -> None:
     files = geotiff(tmp_path / "b.tif"), geotiff(tmp_path / "a.tif", with_never(NEVER, 2))
     first, other = imported(out, *files, *MINUTES)
     np.testing.assert_array_equal(first, FIRE)
@@ -135,12 +135,12 @@ def test_each_file_of_arrivals_or_folder_of_layers_is_a_sequence(tmp_path: Path,
     np.testing.assert_array_equal(second, FIRE[:4])
 
 
-def test_masks_are_the_same_from_files_bands_and_time(tmp_path: Path, out: Path) -> None:
+def test_masks_from_files_bands_and_times_are_equal(tmp_path: Path, out: Path) -> None:
     layers, folder = masks(), tmp_path / "folder"
     folder.mkdir()
     for k, layer in enumerate(layers):
         geotiff(folder / f"step_{k + 8}.tif", layer, nodata=None)  # step_10 comes after step_9
-    # Files that describe layers are not layers.
+    # Auxiliary files are not read as layers.
     with (
         rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False),
         rasterio.open(folder / "step_8.tif", "r+") as file,
@@ -160,7 +160,7 @@ def test_masks_are_the_same_from_files_bands_and_time(tmp_path: Path, out: Path)
         np.testing.assert_array_equal(one(out, *given, *MASKS), FIRE[:4], str(given[0]))
 
 
-def test_masks_of_what_burns_now_and_codes_say_what_is_burnt(tmp_path: Path, out: Path) -> None:
+def test_burning_masks_and_codes_show_burnt_cells(tmp_path: Path, out: Path) -> None:
     burning = geotiff(tmp_path / "burning.tif", *(FIRE == 1), nodata=None)
     np.testing.assert_array_equal(one(out, burning, "--kind", "burning", *STEP), FIRE)
     codes = np.array([7, 3, 5], np.uint8)[FIRE]
@@ -190,9 +190,7 @@ def test_a_step_shows_the_last_layer_at_or_before_its_time(tmp_path: Path, out: 
         np.testing.assert_array_equal(got, states[shown], str((times, unit, flags)))
 
 
-def test_files_that_count_from_days_of_their_own_follow_each_other(
-    tmp_path: Path, out: Path
-) -> None:
+def test_files_with_different_reference_dates_are_ordered(tmp_path: Path, out: Path) -> None:
     folder = tmp_path / "days"
     folder.mkdir()
     for day, part in ((1, FIRE[:2]), (2, FIRE[2:4])):
@@ -218,7 +216,7 @@ BEGINS: list[tuple[str, str | None, str | None]] = [
 ]
 
 
-def test_the_description_says_when_a_sequence_begins(tmp_path: Path, out: Path) -> None:
+def test_the_description_states_when_a_sequence_begins(tmp_path: Path, out: Path) -> None:
     for unit, calendar, begin in BEGINS:
         times = {"times": [90, 100, 110, 120], "time_unit": unit, "calendar": calendar}
         one(out, netcdf(tmp_path / "fire.nc", **times, mask=masks()), *MASKS)
@@ -233,7 +231,7 @@ def test_the_description_says_when_a_sequence_begins(tmp_path: Path, out: Path) 
     assert re.findall("(?m)^# .*", text) == ["# states_001 begins at 2020-08-01 12:05:00 UTC"]
 
 
-def test_sequences_of_like_cells_or_of_any_go_together(tmp_path: Path, out: Path) -> None:
+def test_sequences_need_equal_cells_unless_mixed(tmp_path: Path, out: Path) -> None:
     first = geotiff(tmp_path / "a.tif")
     other = geotiff(tmp_path / "b.tif", cell=(60, 60), crs="EPSG:32611")
     elsewhere = geotiff(tmp_path / "c.tif", corner=(100_000, 3_000_000))
@@ -246,7 +244,7 @@ def test_sequences_of_like_cells_or_of_any_go_together(tmp_path: Path, out: Path
         np.testing.assert_array_equal(states, FIRE)
 
 
-def test_a_larger_cell_burns_from_its_first_to_its_last(tmp_path: Path, out: Path) -> None:
+def test_a_larger_cell_burns_while_any_input_cell_does(tmp_path: Path, out: Path) -> None:
     states = np.zeros((5, 6, 8), np.uint8)
     states[1:, 0, 0], states[3:, 0, 0] = 1, 2  # burns in steps 1 and 2
     states[2:, 1, 1], states[4:, 1, 1] = 1, 2  # burns in steps 2 and 3
@@ -258,9 +256,7 @@ def test_a_larger_cell_burns_from_its_first_to_its_last(tmp_path: Path, out: Pat
         assert not small[:, 1:].any() and not small[:, :, 1:].any()
 
 
-def test_nearest_takes_the_middle_cell_and_smaller_cells_repeat_it(
-    tmp_path: Path, out: Path
-) -> None:
+def test_nearest_uses_the_middle_cell_and_repeats_it(tmp_path: Path, out: Path) -> None:
     states = np.zeros((3, 3, 3), np.uint8)
     states[1:, 1, 1], states[1:, 0, 0] = 1, 2
     file = geotiff(tmp_path / "fire.tif", *states, nodata=None)
@@ -272,7 +268,7 @@ def test_nearest_takes_the_middle_cell_and_smaller_cells_repeat_it(
     np.testing.assert_array_equal(one(out, file, *flags, "--height", 6), doubled)
 
 
-def test_a_part_of_the_input_can_be_used(tmp_path: Path, out: Path) -> None:
+def test_the_input_can_be_cropped(tmp_path: Path, out: Path) -> None:
     part = one(out, geotiff(tmp_path / "fire.tif"), *MINUTES, "--crop", "1,0,2,3")
     np.testing.assert_array_equal(part, FIRE[1:5, 1:, :3])
     layers = masks().astype(np.float32)
@@ -281,7 +277,7 @@ def test_a_part_of_the_input_can_be_used(tmp_path: Path, out: Path) -> None:
     np.testing.assert_array_equal(one(out, file, *MASKS, "--crop", "1,1,2,3"), FIRE[:4, 1:, 1:])
 
 
-def test_times_of_32_bits_fall_into_their_steps(tmp_path: Path, out: Path) -> None:
+def test_rounded_32_bit_times_fall_into_their_steps(tmp_path: Path, out: Path) -> None:
     steps = np.arange(400).reshape(20, 20)
     for unit, step, last in (("h", "6 min", 0.1), ("h", "10 min", 1 / 6), ("d", "1 h", 1 / 24)):
         file = geotiff(tmp_path / "fire.tif", steps * last)
@@ -289,7 +285,7 @@ def test_times_of_32_bits_fall_into_their_steps(tmp_path: Path, out: Path) -> No
         np.testing.assert_array_equal((got == 0).sum(axis=0), steps, step)
 
 
-def test_sequences_are_named_in_order() -> None:
+def test_sequence_names_sort_in_order() -> None:
     file = io.BytesIO()
     arrays([np.zeros((2, 1, 1), np.uint8)] * 1001)(file)
     file.seek(0)
@@ -313,7 +309,7 @@ def test_the_description_has_the_states_of_the_sequences(tmp_path: Path, out: Pa
         assert sum(state["observed_as"]) == pytest.approx(1)
 
 
-def test_it_writes_the_same_bytes_draws_them_and_says_what_came_out(
+def test_output_is_reproducible_drawn_and_summarized(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, picture = geotiff(tmp_path / "fire.tif"), tmp_path / "fire.png"
@@ -329,7 +325,7 @@ def test_it_writes_the_same_bytes_draws_them_and_says_what_came_out(
     assert {(0x3B, 0x6E, 0xA5), (0xC8, 0x37, 0x1B), (0x4A, 0x4A, 0x4A)} <= most
 
 
-def test_the_pages_have_the_flags_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_documents_list_the_flags_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     for words, name, end in (
         ([], "landscapes", "## Time and grid"),
         (["land"], "land", "## Slope and wind"),
@@ -347,7 +343,7 @@ def test_the_package_needs_no_rasterio() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_the_landscape_that_ships_is_what_its_description_says() -> None:
+def test_the_shipped_landscape_matches_its_description() -> None:
     folder = ROOT / "config" / "landscapes" / "jacksboro"
     text = tomllib.loads((folder / "jacksboro.toml").read_text("utf-8"))
     with np.load(folder / "jacksboro.npz") as file:

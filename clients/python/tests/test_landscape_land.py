@@ -50,7 +50,7 @@ def by_hand(row: int, col: int, rise: tuple[float, float], speed: float, towards
     return math.exp(0.078 * slope) * math.exp(speed * (0.045 + 0.131 * (math.cos(angle) - 1)))
 
 
-def test_factors_are_the_published_formula() -> None:
+def test_factors_follow_the_published_formula() -> None:
     rng = np.random.default_rng(1)
     for size in [(3, 3), (1, 5), (5, 3)] * 5:
         rise, speed, towards = rng.normal(0, 0.4, 2), rng.uniform(0, 20), rng.uniform(-360, 360)
@@ -80,7 +80,7 @@ def test_each_cell_is_in_the_zone_of_its_slope_and_aspect() -> None:
         np.testing.assert_allclose(zone.rise, rise[:, cells == number].mean(axis=1))
 
 
-def test_a_slope_is_one_zone_with_the_factors_on_burning_neighbours(tmp_path: Path) -> None:
+def test_a_uniform_slope_is_one_zone_with_scaled_weights(tmp_path: Path) -> None:
     model = made(tmp_path, geotiff(tmp_path / "dem.tif", EASTWARD), *WIND)
     assert [zone["name"] for zone in model["zones"]] == [SLOPE]
     assert model["name"] == "land" and model["zone_map"] == np.zeros((4, 5)).tolist()
@@ -118,7 +118,7 @@ def test_elevation_is_the_same_from_each_format(tmp_path: Path) -> None:
                                    spread(first, first["zones"][0]["name"]), rtol=1e-4)  # fmt: skip
 
 
-def test_zones_of_a_raster_have_the_base_s_kernels(tmp_path: Path) -> None:
+def test_zones_of_a_raster_keep_the_base_models_kernels(tmp_path: Path) -> None:
     values, towns = [[3, 3, -1], [8, 3, 8]], [[0, 0, 2.5], [0, 0, -1]]
     flags = ("--zones", geotiff(tmp_path / "fuel.tif", values, nodata=None), "--unburnable", 8)
     model = made(tmp_path, *flags, "--no-fly", array(tmp_path / "no.npy", towns))
@@ -138,7 +138,7 @@ def test_zones_of_a_raster_have_the_base_s_kernels(tmp_path: Path) -> None:
     ]
 
 
-def test_slopes_divide_zones_but_of_what_never_burns(tmp_path: Path) -> None:
+def test_slopes_divide_only_zones_that_burn(tmp_path: Path) -> None:
     steep = "zone 1, 60 degrees up to the east, aspect W"
     step = np.where(np.arange(6) < 3, 0.0, 100.0) * np.ones((2, 1))
     values = array(tmp_path / "z.npy", [[1] * 6, [2] * 6])
@@ -149,7 +149,7 @@ def test_slopes_divide_zones_but_of_what_never_burns(tmp_path: Path) -> None:
     assert model["zone_map"] == [[0, 0, 1, 1, 0, 0], [2] * 6]
 
 
-def test_kernels_that_do_not_see_the_cell_s_own_state_change_too(tmp_path: Path) -> None:
+def test_kernels_without_own_states_are_adapted(tmp_path: Path) -> None:
     dem = geotiff(tmp_path / "dem.tif", EASTWARD)
     model = made(tmp_path, dem, "--model", "wildfire", "--base-wind")
     base = tomllib.loads((CONFIG / "models/wildfire.toml").read_text("utf-8"))
@@ -161,7 +161,7 @@ def test_kernels_that_do_not_see_the_cell_s_own_state_change_too(tmp_path: Path)
         assert entry.get("scale") == old.get("scale")
 
 
-def test_large_maps_are_in_files_beside_the_model(tmp_path: Path) -> None:
+def test_large_maps_are_written_to_separate_files(tmp_path: Path) -> None:
     values = np.arange(300 * 300).reshape(300, 300) // 30_000
     rasters = ("--zones", array(tmp_path / "z.npy", values))
     model = made(tmp_path, *rasters, "--no-fly", array(tmp_path / "n.npy", values == 1))
@@ -172,14 +172,14 @@ def test_large_maps_are_in_files_beside_the_model(tmp_path: Path) -> None:
         np.testing.assert_array_equal(cells, expected)
 
 
-def test_the_text_has_maps_before_tables_and_any_string() -> None:
+def test_the_text_has_maps_first_and_allows_any_string() -> None:
     model: dict[str, Any] = {"name": 'a "\\ \x7f\n', "sensor": {"radius": 2, "on": True}}
     model |= {"states": [{"x": 1e-05}, {"x": [[1, 2.5]]}], "kernel": [], "zone_map": [[0], [1]]}
     model |= {"rings": {"rings": [{"a": 1, "b": "c"}]}}
     assert tomllib.loads(toml(model)) == model
 
 
-def test_the_command_says_what_it_made(tmp_path: Path) -> None:
+def test_the_command_reports_its_output(tmp_path: Path) -> None:
     dem, out = geotiff(tmp_path / "dem.tif", EASTWARD), tmp_path / "hill.toml"
     command = [sys.executable, "-m", "emberwatch.landscape", "land", dem, "--out", out]
     done = subprocess.run(command, capture_output=True, text=True)

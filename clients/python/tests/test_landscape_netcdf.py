@@ -189,20 +189,20 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
 
 
 @pytest.mark.parametrize("case", APPLIED)
-def test_what_a_file_says_is_applied(case: str, tmp_path: Path) -> None:
+def test_cf_attributes_are_applied(case: str, tmp_path: Path) -> None:
     variables, expected = APPLIED[case]
     file = written(tmp_path / "fire.nc", **variables)
     states = imported(file, len(variables["v"].over), "--oblong")
     np.testing.assert_array_equal(states, expected)
 
 
-def test_any_name_of_a_file_is_read(tmp_path: Path) -> None:
+def test_any_file_name_can_be_read(tmp_path: Path) -> None:
     for name in ('a"b', "a'b", "a:b", "a#b", "a b", "\udce9"):
         file = written(tmp_path / "plain.nc", **grid(ONE)).rename(tmp_path / f"{name}.nc")
         np.testing.assert_array_equal(imported(file, 2, "--name=fire"), FIRE)
 
 
-def test_variables_have_colons_and_groups(tmp_path: Path) -> None:
+def test_variable_names_may_have_colons_and_groups(tmp_path: Path) -> None:
     other = ONE._replace(values=ARRIVAL * 2)
     file = written(tmp_path / "a.nc", y=Y, x=X, at__s=ONE, other=other)
     np.testing.assert_array_equal(imported(file, 2, "--variable=at:s"), FIRE)
@@ -223,7 +223,7 @@ def layer_files(folder: Path, first: Variables, second: Variables) -> NDArray[np
     return imported(folder / "fire", 3, "--oblong")
 
 
-def test_scalar_times_are_those_of_layers(tmp_path: Path) -> None:
+def test_scalar_times_apply_to_layers(tmp_path: Path) -> None:
     mask = ONE._replace(given={"coordinates": "run when"})
     files = [
         grid(
@@ -236,16 +236,14 @@ def test_scalar_times_are_those_of_layers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(layer_files(tmp_path, *files), MASKS[[0, 0, 0, 2]])
 
 
-def test_the_date_has_the_offset_of_packed_times(tmp_path: Path) -> None:
+def test_the_start_date_includes_the_offset_of_packed_times(tmp_path: Path) -> None:
     imported(written(tmp_path / "a.nc", **timed("i2", [-9, -8, -7, -6], add_offset=99.0)), 3)
     text = (tmp_path / "a.toml").read_text("utf-8")
     assert "# states_000 begins at 2020-08-01 01:30:00 UTC" in text
 
 
 @pytest.mark.parametrize("kind", [None, "f8", "i2"])
-def test_bounds_are_packed_as_their_coordinate_is_if_of_its_type(
-    kind: str | None, tmp_path: Path
-) -> None:
+def test_bounds_of_the_same_type_inherit_packing(kind: str | None, tmp_path: Path) -> None:
     given = {"scale_factor": 15.0, "add_offset": 500_000.0, "valid_min": np.int16(0)}
     edged = {**bounded(X, "x"), "y": Y, "v": ONE}
     if kind is not None:
@@ -256,7 +254,7 @@ def test_bounds_are_packed_as_their_coordinate_is_if_of_its_type(
     np.testing.assert_array_equal(layer_files(tmp_path, grid(ONE), edged), MASKS[[0, 2]])
 
 
-def test_longitudes_of_360_degrees_are_those_of_180(tmp_path: Path) -> None:
+def test_longitudes_of_0_to_360_degrees_are_wrapped(tmp_path: Path) -> None:
     west, east = (
         {
             "y": Variable(LAT.values, "f8", ("y",), LAT.given),
@@ -330,7 +328,7 @@ REFUSED: list[tuple[Any, ...]] = [
 ]  # fmt: skip
 
 
-def test_what_cannot_be_applied_is_refused_by_name(
+def test_unsupported_attributes_are_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for words, variables, *flags in REFUSED:

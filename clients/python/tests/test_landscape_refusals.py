@@ -98,7 +98,7 @@ def layers(kind: Flags, *bands: object, flags: Flags = ()) -> Case:
 
 
 def ascii_file(old: str, new: str) -> Case:
-    """Writes an ASCII grid of arrival times with another text at one place."""
+    """Writes an ASCII grid of arrival times, with the text `old` replaced."""
     return lambda f: (edited(ascii_grid(f / "a.asc"), old, new), *ARRIVALS)
 
 
@@ -280,7 +280,7 @@ def test_broken_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
         assert not out.parent.exists(), "nothing is written"
 
 
-def test_output_that_is_there_or_cannot_be_written_is_named(
+def test_existing_or_unwritable_output_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, file = tmp_path / "world.npz", geotiff(tmp_path / "a.tif")
@@ -317,7 +317,7 @@ def test_a_missing_library_names_the_extra(
 
 
 @pytest.mark.parametrize("ending", [".npy", ".npz"])
-def test_damaged_numpy_files_are_refused_or_read(
+def test_damaged_numpy_files_never_crash_the_reader(
     ending: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = io.BytesIO()
@@ -339,7 +339,7 @@ def test_damaged_numpy_files_are_refused_or_read(
     assert len(told) > 3, told
 
 
-def test_the_limits_are_on_the_page() -> None:
+def test_the_limits_are_documented() -> None:
     page = (Path(__file__).parents[3] / "docs/landscapes.md").read_text("utf-8")
     for words in (
         f"more than {MOST_STATES >> 30} GiB of states",

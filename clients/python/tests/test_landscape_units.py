@@ -37,9 +37,9 @@ class Map(NamedTuple):
     """Width and height of a cell in metres."""
     flags: str = ""
     height: float = 1.0
-    """Metres of a unit of height."""
+    """Length of the unit of height in metres."""
     unit: str | None = None
-    """Of heights, as the raster says it."""
+    """Unit of heights, as the raster states it."""
     ending: str = ".tif"
 
 
@@ -128,7 +128,7 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, *flags: object) ->
     return line
 
 
-def test_it_says_what_units_it_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_assumed_units_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assumed = "heights in metres (assumed, as the raster names no unit; --height-unit sets it)"
     model, dem = tmp_path / "new" / "land.toml", geotiff(tmp_path / "dem.tif", EASTWARD)
     made(tmp_path, dem)
@@ -162,7 +162,7 @@ NO_PLACE: list[tuple[dict[str, Any], str, str]] = [
         ({"crs": None, "corner": corner, "cell": (cell, cell)}, "", MAY_BE_DEGREES)
         for corner, cell in (((-120, 38), SECOND), ((179.9, -16), 0.1), ((0, 91), 0.5))
     ),
-    # Far from its meridian, as MODIS tiles of California are, rows and columns are askew.
+    # Far from the central meridian, as in California, rows are not perpendicular to columns.
     ({"crs": SINUSOIDAL, "corner": (-1e7, 4e6)}, "",
         "dem.tif: expected square cells, got rows and columns at 139 degrees; reproject it"),
     ({"crs": "EPSG:4326", "corner": (0, 900), "cell": (1, 1)}, "",
@@ -170,7 +170,7 @@ NO_PLACE: list[tuple[dict[str, Any], str, str]] = [
 ]  # fmt: skip
 
 
-def test_cells_of_no_known_size_are_refused(
+def test_cells_of_unknown_size_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for place, flags, words in NO_PLACE:
@@ -189,7 +189,7 @@ def test_cells_of_no_known_size_are_refused(
     made(tmp_path, mercator, "--oblong")
 
 
-def test_a_grid_turned_from_true_north_is_told(
+def test_a_grid_turned_from_true_north_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made(tmp_path, geotiff(tmp_path / "c.tif", EASTWARD, crs="EPSG:3979", corner=(-2e6, 8e5)))
@@ -198,7 +198,7 @@ def test_a_grid_turned_from_true_north_is_told(
     assert "north" not in notes(capsys)
 
 
-def test_cells_without_a_value_in_a_mask_are_free(
+def test_mask_cells_without_a_value_are_free(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     towns = np.full((4, 5), 255, "u1")
@@ -209,7 +209,7 @@ def test_cells_without_a_value_in_a_mask_are_free(
     assert f"{mask}: 6 no-fly cells; 14 of the other cells have no value" in notes(capsys)
 
 
-def test_cells_without_a_zone_get_the_number_of_a_flag(tmp_path: Path) -> None:
+def test_a_flag_sets_the_zone_of_cells_without_a_value(tmp_path: Path) -> None:
     fuel = np.array([[1, 1, -9999], [2, -9999, 2]])
     zones = geotiff(tmp_path / "fuel.tif", fuel, nodata=-9999, dtype="int16")
     model = made(tmp_path, "--zones", zones, "--missing-zone", 0, "--unburnable", 0)
@@ -217,7 +217,7 @@ def test_cells_without_a_zone_get_the_number_of_a_flag(tmp_path: Path) -> None:
     assert model["zone_map"] == [[1, 1, 0], [2, 0, 2]]
 
 
-def test_a_wind_comes_from_a_point_of_the_compass(tmp_path: Path) -> None:
+def test_the_wind_can_be_given_as_a_compass_point(tmp_path: Path) -> None:
     words = {"N": 270, "wsw": 22.5, "north-west": 315, "South South East": 112.5, "250": 20}
     for comes_from, towards in words.items():
         assert bearing(comes_from) == (270 - towards) % 360
@@ -226,7 +226,7 @@ def test_a_wind_comes_from_a_point_of_the_compass(tmp_path: Path) -> None:
     assert models[0] == models[1]
 
 
-def test_units_are_known_in_the_words_of_files() -> None:
+def test_common_spellings_of_units_are_known() -> None:
     words = {
         "m": "m M metre metres Meter meters",
         "ft": "ft foot Feet international_foot",
@@ -246,7 +246,7 @@ def test_units_are_known_in_the_words_of_files() -> None:
     assert set(METRES) == set(words)
 
 
-def test_one_projection_in_other_words_is_the_same() -> None:
+def test_one_projection_has_several_spellings() -> None:
     for code in (UTM, "EPSG:2263", "EPSG:4326", "EPSG:3857"):
         crs = CRS(code)
         texts = [crs.to_wkt(version) for version in ("WKT2_2019", "WKT1_GDAL", "WKT1_ESRI")]
@@ -265,7 +265,7 @@ def world(folder: Path, file: Path, cell: float) -> tuple[int, ...]:
         return sequences["states_000"].shape[1:]
 
 
-def test_cells_of_a_recorded_world_are_metres_on_the_ground(
+def test_cells_of_recorded_worlds_are_measured_on_the_ground(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fire = ARRIVAL.repeat(4, axis=0).repeat(4, axis=1)
@@ -290,7 +290,7 @@ def mapped(path: Path, unit: str, factor: float, corner: tuple[float, float], **
     return written(path, x=x, y=y, z=z, crs=Variable(0, "i4", (), mapping))
 
 
-def test_a_grid_mapping_says_how_large_cells_of_a_netcdf_file_are(
+def test_a_grid_mapping_sets_the_size_of_netcdf_cells(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mercator = {"grid_mapping_name": "mercator", "standard_parallel": 0.0}

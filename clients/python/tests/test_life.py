@@ -1,4 +1,4 @@
-"""The life of environments of one world or many: closed, copied, and on servers that fail."""
+"""The life cycle of environments: closing, copying, and servers that fail."""
 
 import copy
 import pickle
@@ -62,7 +62,7 @@ def fly(env: Any) -> Any:
     return step
 
 
-def test_close_twice_is_fine_and_reset_opens_again(making: Make) -> None:
+def test_close_may_be_repeated_and_reset_reopens(making: Make) -> None:
     env = making()
     with fails("closed", match="reset it first"):
         fly(env.unwrapped)
@@ -84,7 +84,7 @@ def test_a_reset_attaches_to_the_next_server(attached: Any, started: Server) -> 
     assert_same(rollout(attached, 6, seed=5), expected)
 
 
-def test_worlds_that_are_gone_are_not_gone_on_with(attached: Any, started: Server) -> None:
+def test_worlds_of_an_ended_server_cannot_continue(attached: Any, started: Server) -> None:
     options: list[dict[str, Any]] = [{"resume": True}]
     if isinstance(attached, VectorEnv):
         options.append({"reset_mask": np.array([True, False])})
@@ -96,7 +96,7 @@ def test_worlds_that_are_gone_are_not_gone_on_with(attached: Any, started: Serve
         attached.reset(seed=1)
 
 
-def test_a_stopped_server_times_out_and_resume_goes_on(attached: Any, started: Server) -> None:
+def test_a_stopped_server_times_out_and_resume_continues(attached: Any, started: Server) -> None:
     started.stop()
     with impatient(attached), pytest.raises(RequestTimeoutError):
         fly(attached)
@@ -108,7 +108,7 @@ def test_a_stopped_server_times_out_and_resume_goes_on(attached: Any, started: S
     assert np.all(fly(attached) == info["step"] + 1)
 
 
-def test_a_live_environment_is_not_copied_but_says_what_to_do(making: Make) -> None:
+def test_copying_an_open_environment_is_refused(making: Make) -> None:
     env = making()
     expected = rollout(env, 3, seed=1)
     kind = type(env.unwrapped).__name__

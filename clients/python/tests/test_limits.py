@@ -104,7 +104,7 @@ def test_worlds_beyond_a_ulimit_are_refused_with_numbers() -> None:
         assert f"the limit {name}; raise it (`ulimit " in said, said
 
 
-def test_a_cgroup_limits_worlds_by_its_memory() -> None:
+def test_a_cgroups_memory_limits_the_worlds() -> None:
     few = """
 client = emberwatch.embed(worlds=32, height=512, width=512, moves=4, burn_in=0)
 lease = client.acquire(0, 32)
@@ -121,14 +121,14 @@ print(len(lease.reset(range(32))))
         assert python(few, limit=enter) == "32\n"
 
 
-def test_beliefs_beyond_a_limit_are_refused_before_they_are_made() -> None:
+def test_beliefs_beyond_a_limit_are_refused_early() -> None:
     code = """
 from emberwatch import belief
 from emberwatch.model import Model
 model = Model.named("wildfire-burnout")
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-# A belief alone takes 240 bytes and 3 KiB, with its tables and cavities 6 and 160 KiB.
+# A belief alone takes 240 bytes or 3 KiB; with tables and cavities, 6 or 160 KiB.
 for kind, side, n_worlds in ("known", 4, 1 << 20), ("known+cavities", 16, 40_000):
     prior, before = belief.uniform_prior(model, height=side, width=side), peak()
     tell(lambda: belief.known(model, prior=prior, kind=kind, n_worlds=n_worlds))
@@ -139,14 +139,14 @@ for kind, side, n_worlds in ("known", 4, 1 << 20), ("known+cavities", 16, 40_000
         assert f" MiB for the beliefs about {n_worlds} worlds, got " in error
 
 
-def test_memory_errors_are_of_both_kinds() -> None:
+def test_memory_errors_are_also_python_memory_errors() -> None:
     with pytest.raises(MemoryError, match="for 1024 worlds of 4096 x 4096 cells") as caught:
         emberwatch.embed(worlds=1024, height=4096, width=4096)
     assert isinstance(caught.value, EmberwatchError)
 
 
 @as_root
-def test_a_user_who_may_start_no_thread_is_told_the_limit() -> None:
+def test_the_limit_on_threads_is_named() -> None:
     code = """
 make = lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0)
 make().close()
@@ -160,7 +160,7 @@ tell(make)
     assert said.count("Resource temporarily unavailable") == 1, said
 
 
-def test_a_cgroup_without_threads_is_named() -> None:
+def test_a_cgroups_limit_on_threads_is_named() -> None:
     flags = [f"--instance={unused_instance()}", "--threads=16", "--burn-in=0"]
     with cgroup("pids", ["pids.max"], "6") as (outer, enter):
         ended = run(find("emberwatch-server"), *flags, limit=enter)
@@ -173,7 +173,7 @@ def test_a_cgroup_without_threads_is_named() -> None:
 
 
 @on_x86
-def test_a_refused_call_is_named_and_not_taken_for_no_server() -> None:
+def test_a_refused_system_call_is_named() -> None:
     running = server()
     code = """
 import logging
@@ -204,7 +204,7 @@ tell(lambda: emberwatch.connect(sys.argv[1], wait=100))
 
 
 @on_x86
-def test_what_a_seccomp_profile_hides_is_called_so() -> None:
+def test_calls_hidden_by_a_seccomp_profile_are_named() -> None:
     code = """
 refuse(435, 1)
 tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())
@@ -241,7 +241,7 @@ print(free, needed, count() - before)
 """
 
 
-def test_a_connection_takes_as_many_descriptors_as_it_says() -> None:
+def test_a_connection_needs_as_many_descriptors_as_reported() -> None:
     instance = server().instance
     for kind in ("connect", "observe"):
         free, needed, left = map(int, python(DESCRIPTORS, instance, kind).split())

@@ -35,7 +35,7 @@ def of(*cells: tuple[int, int]) -> list[list[int]]:
     return [[int(legal) for legal in land.legal_moves(cell, land.NO_FLY)] for cell in cells]
 
 
-def test_a_lone_robot_s_mask_is_in_infos_and_samples(world: dict[str, Any]) -> None:
+def test_infos_have_a_lone_robots_mask_for_sampling(world: dict[str, Any]) -> None:
     env = make(MOVES, **world)
     with fails("closed"):
         env.unwrapped.action_masks()
@@ -54,12 +54,12 @@ def test_a_lone_robot_s_mask_is_in_infos_and_samples(world: dict[str, Any]) -> N
         assert is_mask(info["action_mask"], expected)
 
 
-def test_a_robot_without_a_way_may_choose_any_move() -> None:
+def test_an_enclosed_robot_may_choose_any_move() -> None:
     alone = make(MOVES, height=1, width=1, burn_in=0)
     assert is_mask(alone.reset(seed=1000)[1]["action_mask"], [1, 1, 1, 1])
 
 
-def test_masks_pass_wrappers(world: dict[str, Any]) -> None:
+def test_masks_pass_through_wrappers(world: dict[str, Any]) -> None:
     for wrap in (
         lambda env: FrameStackObservation(env, 2),
         lambda env: BeliefObservation(RecordEpisodeStatistics(env), keep=True),
@@ -99,7 +99,7 @@ def test_vectors_have_a_mask_for_each_robot(world: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("observation", ["local", ("local", "action_mask")])
-def test_teams_have_them_where_pettingzoo_looks(world: dict[str, Any], observation: Any) -> None:
+def test_teams_have_masks_where_pettingzoo_looks(world: dict[str, Any], observation: Any) -> None:
     env = closed_later(emberwatch.parallel_env(observation=observation, **world))
     seen, infos = env.reset(seed=1000)
     for number, agent in enumerate(env.agents):
@@ -128,9 +128,7 @@ def test_paths_have_no_mask(world: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["single", "dummy", "native"])
-def test_maskable_ppo_trains_and_chooses_only_moves_that_lead_on(
-    world: dict[str, Any], kind: str
-) -> None:
+def test_maskable_ppo_chooses_only_valid_moves(world: dict[str, Any], kind: str) -> None:
     contrib = pytest.importorskip("sb3_contrib")
     from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
     from stable_baselines3.common.env_util import make_vec_env as dummies

@@ -1,4 +1,4 @@
-"""Model files: Python reads what the server accepts, and refuses the rest in its words."""
+"""Model files: Python reads what the server accepts, and refuses the rest with its errors."""
 
 import copy
 import pickle
@@ -31,14 +31,14 @@ def changed(old: str, new: str) -> str:
     return WILDFIRE.replace(old, new, 1)
 
 
-def test_names_are_those_of_the_programs() -> None:
+def test_names_match_the_programs() -> None:
     names = built_in("models")
     for name, text in names.items():
         assert text == (CONFIG / f"{name}.toml").read_text()
         assert Model.named(name).name == Model.named(Path(name)).name == name
     command = [find("emberwatch-agent"), "run", "--model=no/such"]
     words = subprocess.run(command, capture_output=True, text=True).stderr
-    known = re.search(r"no/such: No such file: expected one, or (.*)", words)
+    known = re.search(r"no/such: No such file: expected a file, or one of (.*)", words)
     assert known is not None and set(known[1].split(", ")) == set(names)
 
 
@@ -49,14 +49,14 @@ def test_the_edge_is_the_state_of_cells_outside_the_grid() -> None:
 
 
 @pytest.mark.parametrize("file", sorted(CONFIG.iterdir()), ids=lambda file: file.stem)
-def test_files_are_read_as_the_oracle_reads_them(file: Path) -> None:
+def test_files_are_read_as_by_the_oracle(file: Path) -> None:
     model, expected = Model.from_toml(file.read_text()), oracle.parameters(file.read_text())
     got = model.kernels, model.bias, model.observation_matrix, model.initial
     for one, other in zip(got, expected[:4], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-15)
 
 
-def test_models_that_say_the_same_are_equal() -> None:
+def test_models_with_equal_contents_are_equal() -> None:
     model = Model.wildfire()
     same = Model.from_toml("# another text\n" + WILDFIRE)
     assert model == same and hash(model) == hash(same)
@@ -66,11 +66,11 @@ def test_models_that_say_the_same_are_equal() -> None:
     assert model != "wildfire"
 
 
-def test_what_is_no_model_is_refused_in_the_programs_words(tmp_path: Path) -> None:
+def test_invalid_models_are_refused_with_the_servers_error(tmp_path: Path) -> None:
     path = tmp_path / "model.toml"
     path.write_text(changed("initial = 0.99", "initial = 0.5"))
     for name, words in (
-        ("ash", "model file ash: No such file .*: expected one, or .*wildfire, "),
+        ("ash", "model file ash: No such file .*: expected a file, or one of .*wildfire, "),
         (tmp_path / "none.toml", "none.toml: No such file"),
         (tmp_path, f"model file {tmp_path}: Is a directory"),
         (path, r"model\.toml: .*initial: expected a sum of 1, got 0.51"),

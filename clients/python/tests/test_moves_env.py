@@ -19,7 +19,7 @@ def test_the_world_moves_after_a_whole_path() -> None:
     assert {type(move) for move in moves} == {np.int64}
 
 
-def test_the_truth_is_revealed_only_when_asked_for() -> None:
+def test_the_truth_is_revealed_only_on_request() -> None:
     env = make(MOVES, reward="move", render_mode="rgb_array")
     plain = make(MOVES, render_mode="rgb_array")
     for one in (env, plain):
@@ -27,7 +27,7 @@ def test_the_truth_is_revealed_only_when_asked_for() -> None:
     assert_same(env.render(), plain.render())
 
 
-def test_episodes_are_truncated_after_max_episode_steps_moves() -> None:
+def test_max_episode_steps_counts_moves() -> None:
     env = make(MOVES, max_episode_steps=6)
     transitions = rollout(env, 6, seed=1)
     assert [transition[3] for transition in transitions[1:]] == [False] * 5 + [True]
@@ -38,14 +38,14 @@ def test_episodes_are_truncated_after_max_episode_steps_moves() -> None:
     assert gymnasium.spec(MOVES).max_episode_steps == 64_000
 
 
-def test_moves_come_as_any_integer() -> None:
+def test_moves_may_be_any_integer_type() -> None:
     env = make(MOVES)
     for kind in (int, np.int64, np.uint8, np.array, lambda n: np.array([n])):
         env.reset(seed=1)
         assert env.step(kind(1))[0]["robot"].tolist() == [1, 0]
 
 
-def test_paying_moves_needs_a_server_that_tells_enough() -> None:
+def test_move_rewards_need_published_truth_and_a_model() -> None:
     with serving() as instance, refuses("expected a server started with --publish-truth"):
         make(MOVES, instance=instance, reward="move")
     with (
@@ -60,7 +60,7 @@ def test_paying_moves_needs_a_server_that_tells_enough() -> None:
             make(MOVES, instance=instance).reset()
 
 
-def test_resume_begins_a_new_path_where_the_world_stands() -> None:
+def test_resume_begins_a_new_path_at_the_robots_cell() -> None:
     with serving() as instance:
         first = make(instance=instance)
         first.reset(seed=1)

@@ -62,7 +62,7 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
         client.status()
 
 
-def test_bayes_rule_refuses_beliefs_that_are_none() -> None:
+def test_bayes_rule_refuses_invalid_beliefs() -> None:
     likelihood, frames = WILDFIRE.observation_matrix, np.zeros((1, 2, 2), np.uint8)
     beliefs = np.full((3, 1, 2, 2), 1 / 3)
     with refuses(r"belief: expected shape \(0, 1, 2, 2\)"):
@@ -77,7 +77,7 @@ def test_bayes_rule_refuses_beliefs_that_are_none() -> None:
     assert beliefs[0, 0, 0, 0] == 1 / 3
 
 
-def test_a_lease_flies_no_robots_of_others() -> None:
+def test_a_lease_refuses_robots_of_others() -> None:
     lease = server(worlds=4).connect().acquire(1, 2)
     for first, n in ((0, 1), (2, 2), (0, 4), (2**32 - 1, 1)):
         with refuses("step: expected robots of worlds 1..3"):
@@ -102,7 +102,7 @@ def test_numbers_out_of_range_are_refused() -> None:
         _native.beam_search(values, robots, np.zeros(1, np.uint64), 4097, 1)
 
 
-def test_other_threads_run_beside_work_on_large_grids() -> None:
+def test_other_threads_run_during_work_on_large_grids() -> None:
     prior = initial_prior(WILDFIRE, height=600, width=600)
     beliefs, frames = np.repeat(prior[:, np.newaxis], 2, axis=1), np.zeros((2, 600, 600), np.uint8)
     phi = _native.Transition(WILDFIRE.toml, 600, 600)
@@ -133,7 +133,7 @@ def meets(work: Callable[[], object], kind: type[Exception], words: str) -> None
     thread.join()
 
 
-def test_flights_refuse_rows_and_states_of_others() -> None:
+def test_flights_refuse_wrong_rows_and_states() -> None:
     def flights(n_moves: int = 4) -> _native.Flights:
         return _native.Flights(2, 3, 5, n_moves, [1.0])
 

@@ -51,7 +51,7 @@ def decide(env: Any) -> Any:
 
 
 @pytest.mark.parametrize("keywords", [{}, {"truth": True, "estimator": "spatial_filter"}])
-def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
+def test_the_environment_checker_passes(keywords: dict[str, Any]) -> None:
     env = make(render_mode="rgb_array", **keywords)
     with environments.no_warnings():
         check_env(env, skip_render_check=True)
@@ -59,7 +59,7 @@ def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
     assert picture.dtype == np.uint8 and picture.ndim == 3
 
 
-def test_actions_and_numbers_have_names(env: Any) -> None:
+def test_actions_and_features_have_names(env: Any) -> None:
     observation, _ = env.reset(seed=1000)
     assert env.action_space.n == len(env.objectives)
     assert observation.shape == (len(env.objectives), len(env.feature_names)) == (8, 26)
@@ -74,7 +74,7 @@ def test_actions_and_numbers_have_names(env: Any) -> None:
     assert np.allclose(named["n_paths"], 1 / 200)
 
 
-def test_types_documents_and_refusals_name_the_same_estimators() -> None:
+def test_types_docs_and_errors_list_the_same_estimators() -> None:
     estimators = _native.estimator_names()
     names = [name for name, _ in estimators]
     assert list(get_args(Estimator)) == names
@@ -87,7 +87,7 @@ def test_types_documents_and_refusals_name_the_same_estimators() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*is out of date")
-def test_the_former_version_is_named() -> None:
+def test_the_former_version_is_refused_by_name() -> None:
     with pytest.raises(gymnasium.error.DeprecatedEnv, match="WildfireObjective-v1"):
         gymnasium.make("emberwatch/WildfireObjective-v0")
 
@@ -119,7 +119,7 @@ def believing(name: str, checkpoints: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", golden_options.BELIEFS)
-def test_episodes_are_those_that_were_recorded(name: str, checkpoints: Path) -> None:
+def test_episodes_equal_the_recorded_ones(name: str, checkpoints: Path) -> None:
     keywords = believing(name, checkpoints)
     env = make(**keywords)
     assert env.estimator == name.partition(",")[0]
@@ -136,7 +136,7 @@ def test_episodes_are_those_that_were_recorded(name: str, checkpoints: Path) -> 
 
 @pytest.mark.parametrize("name", ["spatial_filter", "neural_belief"])
 @pytest.mark.parametrize("is_left", [True, False])
-def test_the_next_one_goes_on_from_the_same_belief(
+def test_the_next_agent_continues_from_the_same_belief(
     name: str, is_left: bool, checkpoints: Path
 ) -> None:
     """Resumes from the belief that was left, or from the frames that the server keeps."""
@@ -161,7 +161,7 @@ def test_the_next_one_goes_on_from_the_same_belief(
     assert_same(found, seen)
 
 
-def test_beliefs_are_shown_to_those_who_watch() -> None:
+def test_beliefs_are_published_to_readers() -> None:
     started = server(worlds=3)
     envs = make_vec(2, instance=started.instance, world=1)
     envs.reset(seed=1000)
@@ -189,7 +189,7 @@ def ringed(folder: Path) -> Path:
     return model
 
 
-def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_that_does_not_fit_is_refused(checkpoints: Path, tmp_path: Path) -> None:
     for name in ("learned_filter", "neural_belief"):
         for maker in (make, make_vec):
             with refuses("checkpoint: expected the world's 6 observations, got 3"):
@@ -199,7 +199,7 @@ def test_a_misfit_checkpoint_is_refused_by_name(checkpoints: Path, tmp_path: Pat
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
 
 
-def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> None:
+def test_recorded_worlds_need_a_learned_belief(tmp_path: Path) -> None:
     states = tmp_path / "lab.npy"
     np.save(states, np.random.default_rng(5).integers(0, 3, (30, 7, 9), np.uint8))
     states.with_suffix(".toml").write_bytes(environments.RECORDED.read_bytes())
@@ -213,7 +213,7 @@ def test_recorded_worlds_are_decided_for_on_a_learned_belief(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("maker", [make, make_vec])
-def test_a_resume_after_an_unfinished_step_knows_all_frames(
+def test_resume_after_an_unfinished_step_has_all_frames(
     maker: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, other = (maker() for _ in range(2))
@@ -233,7 +233,7 @@ def test_a_resume_after_an_unfinished_step_knows_all_frames(
     assert_same(found, seen)
 
 
-def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
+def test_a_forked_child_plans_on_its_own_threads(checkpoints: Path) -> None:
     keywords = believing("neural_belief", checkpoints)
     envs = make_vec(2, **keywords)
     expected = rollout(envs, 3, seed=1000)
@@ -259,7 +259,7 @@ def test_a_forked_child_plans_on_threads_of_its_own(checkpoints: Path) -> None:
     process.join()
 
 
-def test_exploiting_makes_the_steps_of_a_policy_that_does() -> None:
+def test_the_exploit_option_flies_like_the_exploit_policy() -> None:
     belief, estimator, found = "known+spatial", "spatial_filter", list[Any]()
     for flies in (False, True):
         started = server(seed=1000, height=16, width=12, moves=8, burn_in=300)
@@ -279,7 +279,7 @@ def test_exploiting_makes_the_steps_of_a_policy_that_does() -> None:
     assert_same(*found)
 
 
-def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
+def test_waiting_for_truth_ends_at_the_timeout() -> None:
     started = server(publish_truth=True)
     env = make(instance=started.instance, truth=True)
     _, info = env.reset(seed=1000)
@@ -288,7 +288,7 @@ def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
         env._session._truth.at([(9, 9, 9)], 0.2)
 
 
-def test_a_hidden_model_must_be_given() -> None:
+def test_a_hidden_model_must_be_passed() -> None:
     instance = server(reveal_model=False).instance
     with refuses("model: expected a model for the estimator 'known_model', or a checkpoint"):
         make(instance=instance)
@@ -297,7 +297,7 @@ def test_a_hidden_model_must_be_given() -> None:
     assert env.step(2)[4]["step"] == 1
 
 
-def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> None:
+def test_a_learned_belief_needs_no_revealed_model(checkpoints: Path) -> None:
     """Checks that features are the same as when the server reveals its model."""
     flags = {"model": "wildfire-small", "height": 16, "width": 16, "moves": 16, "sensor_radius": 1}
     shown = [server(**flags, **one).instance for one in ({}, {"reveal_model": False})]
@@ -308,7 +308,7 @@ def test_a_hidden_model_is_not_needed_on_a_learned_belief(checkpoints: Path) -> 
             env.close()
 
 
-def test_a_wrong_keyword_is_refused() -> None:
+def test_wrong_keyword_values_are_refused() -> None:
     for keywords, words in (
         ({"estimator": "truth"}, 'estimator: expected one of known_model, .*, got "truth"'),
         ({"prior": "none"}, "prior: expected 'simulated', 'initial' or 'uniform', got 'none'"),

@@ -15,7 +15,7 @@ from emberwatch.wrappers import BeliefObservation
 SMALL: dict[str, Any] = {"height": 12, "width": 12, "n_moves": 6, "model": "wildfire-small"}
 
 
-def test_an_image_shows_each_value_in_a_channel_of_its_own() -> None:
+def test_an_image_has_one_channel_per_value() -> None:
     env = make(observation=("frame", "image"))
     env.reset(seed=3)
     shown = set[int]()
@@ -30,7 +30,7 @@ def test_an_image_shows_each_value_in_a_channel_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
-def test_a_belief_is_what_the_filter_predicts(name: str) -> None:
+def test_the_belief_part_is_the_filters_prediction(name: str) -> None:
     env, filtered = make(name, observation="belief"), BeliefObservation(make(name))
     seen = [env.reset(seed=5)[0], *(env.step(action)[0] for action in actions(env, 9))]
     filtered.reset(seed=5)
@@ -66,7 +66,7 @@ def test_a_window_shows_the_belief_around_the_robot() -> None:
     assert len({tuple(seen["robot"]) for seen in steps}) > 3
 
 
-def test_a_window_shows_what_was_last_seen_around_the_robot() -> None:
+def test_a_window_shows_the_last_observations_nearby() -> None:
     with serving(reveal_model=False, model=LIVELY) as instance:
         for part in ("belief", "local"):
             with refuses("observation: expected a server that reveals its mo"):
@@ -94,7 +94,7 @@ def test_a_window_shows_what_was_last_seen_around_the_robot() -> None:
                     expected[seen["frame"] == np.arange(3)] = 1
 
 
-def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
+def test_a_resumed_belief_uses_only_the_last_frame() -> None:
     with serving(model=LIVELY) as instance:
         first = make(instance=instance, observation=("frame", "belief"))
         first.reset(seed=4)
@@ -108,7 +108,7 @@ def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
         assert not np.array_equal(seen["belief"], unseen["belief"])
 
 
-def test_fires_live_on_in_small_worlds() -> None:
+def test_fires_persist_in_small_worlds() -> None:
     keywords = {**SMALL, "n_moves": 1, "burn_in": 1000}
     worlds = gymnasium.make_vec(WILDFIRE, num_envs=50, max_episode_steps=-1, truth=True, **keywords)
     _, infos = worlds.reset(seed=1000)

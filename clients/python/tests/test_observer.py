@@ -29,7 +29,7 @@ def paths(k: int, n_worlds: int = 1) -> np.ndarray:
     return np.random.default_rng(k).integers(0, 4, (n_worlds, 6))
 
 
-def test_a_frame_is_the_answer_of_its_step_with_the_path_flown() -> None:
+def test_a_published_frame_equals_the_steps_answer() -> None:
     started = server(worlds=2)
     lease = started.connect().acquire(1)
     with observe(started.instance) as observer:
@@ -54,7 +54,7 @@ def test_a_frame_is_the_answer_of_its_step_with_the_path_flown() -> None:
     assert sum(frame.n_lost for frame in frames) == 0
 
 
-def test_losses_among_other_worlds_are_counted() -> None:
+def test_lost_samples_of_other_worlds_are_counted() -> None:
     started = server(worlds=2)
     lease = started.connect().acquire(0, 2)
     with observe(started.instance, world=1) as observer, observe(started.instance) as other:
@@ -71,7 +71,7 @@ def test_losses_among_other_worlds_are_counted() -> None:
     assert sum(frame.n_lost for frame in frames[1:]) == 0
 
 
-def test_iterating_ends_when_no_frame_comes_in_time() -> None:
+def test_iteration_ends_when_no_frame_arrives_in_time() -> None:
     started = server()
     frames: list[Frame] = []
     with observe(started.instance, timeout=0.2) as observer:
@@ -81,7 +81,7 @@ def test_iterating_ends_when_no_frame_comes_in_time() -> None:
     assert list(observe(unused_instance(), timeout=0)) == []
 
 
-def test_a_closed_reader_says_so_and_may_be_closed_again() -> None:
+def test_a_closed_reader_refuses_and_may_be_closed_again() -> None:
     for make in (observe, TruthReader):
         reader = make(unused_instance())
         for _ in range(3):
@@ -90,7 +90,7 @@ def test_a_closed_reader_says_so_and_may_be_closed_again() -> None:
             reader.receive(0)
 
 
-def test_an_agent_s_beliefs_are_read() -> None:
+def test_an_agents_beliefs_can_be_read() -> None:
     started = server(height=16, width=24, moves=12, burn_in=500)
     command = [find("emberwatch-agent"), "run", "--instance", started.instance]
     with OutlookReader(started.instance) as reader:
@@ -111,7 +111,7 @@ def test_an_agent_s_beliefs_are_read() -> None:
             agent.kill()
 
 
-def test_readers_beyond_limits_and_impossible_ones_are_refused() -> None:
+def test_too_many_or_invalid_readers_are_refused() -> None:
     kinds = observe, TruthReader, OutlookReader
     names = "MAX_OBSERVERS", "MAX_TRUTH_READERS", "MAX_AGENT_READERS"
     started = server(publish_truth=True)

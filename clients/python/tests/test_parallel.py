@@ -38,14 +38,14 @@ def team(**keywords: Any) -> WildfireParallelEnv:
 
 
 @pytest.mark.parametrize(("robots", "observation"), [(2, "local"), (3, "others")])
-def test_pettingzoo_finds_no_fault(robots: int, observation: str) -> None:
+def test_pettingzoos_test_passes(robots: int, observation: str) -> None:
     with no_warnings():
         parallel_api_test(team(robots=robots, observation=observation), num_cycles=100)
         env = parallel_to_aec(team(robots=robots, observation=observation, max_episode_steps=9))
         api_test(env, num_cycles=50)
 
 
-def test_pettingzoo_finds_no_fault_in_paths() -> None:
+def test_pettingzoos_test_passes_with_paths() -> None:
     with no_warnings():
         parallel_api_test(team(action="path", max_episode_steps=20), num_cycles=50)
         for action in ("move", "path"):
@@ -58,7 +58,7 @@ def test_pettingzoo_finds_no_fault_in_paths() -> None:
     assert all("bservation" in text or "ction" in text for text in about), about
 
 
-def test_without_pettingzoo_an_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_pettingzoo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
     monkeypatch.delitem(sys.modules, "emberwatch.envs.parallel")
     told = r"pip install emberwatch\[teams\]; got: .*pettingzoo"
@@ -82,7 +82,7 @@ PARTS = ("frame", "robot", "age", "belief", "team", "others")
 
 
 @pytest.mark.parametrize("reward", ["share", "team", "marginal"])
-def test_each_agent_sees_and_earns_what_its_row_does(reward: str) -> None:
+def test_each_agent_equals_a_row_of_the_vector_environment(reward: str) -> None:
     keywords = {"observation": PARTS, "reward": reward, "robots": 3, "max_episode_steps": 5}
     ours, rows = team(action="path", **keywords), make_vec(3, **keywords)
     actions = random_actions(5, 3, (4,))
@@ -100,7 +100,7 @@ def test_each_agent_sees_and_earns_what_its_row_does(reward: str) -> None:
     assert ours.agents == [] and all(outcomes[-1][3].values())
 
 
-def test_rewards_of_a_team_are_what_its_definition_says() -> None:
+def test_team_rewards_follow_their_definition() -> None:
     """Checks that shares sum to the team's reward, and that a shared cell pays once."""
     paths = random_actions(30, 4, (4,))
     flown: dict[str, list[dict[str, float]]] = {}
@@ -118,7 +118,7 @@ def test_rewards_of_a_team_are_what_its_definition_says() -> None:
     assert n_apart > 5, "robots that begin in one cell meet"
 
 
-def test_the_state_is_what_the_team_saw_and_where_it_is() -> None:
+def test_the_state_shows_the_teams_frame_and_cells() -> None:
     env = team(action="path", observation=("frame", "robot"))
     env.reset(seed=3)
     for action in random_actions(5, 4, (4,)):
@@ -148,7 +148,7 @@ def test_a_team_is_drawn_as_a_whole() -> None:
     assert (env.render() != before).any()
 
 
-def test_impossible_teams_are_named() -> None:
+def test_invalid_team_keywords_are_named() -> None:
     rows: list[tuple[dict[str, Any], str]] = [
         ({"action": "fly"}, "action: expected 'move' or 'path', got 'fly'"),
         ({"robots": 0}, "robots: expected at least 1, got 0"),
@@ -189,7 +189,7 @@ def alone(instance: str, robot: int, **keywords: Any) -> Any:
 
 
 @pytest.mark.parametrize(("order", "reward"), [((0, 1, 2, 3), "share"), ((3, 1, 0, 2), "marginal")])
-def test_four_environments_of_one_robot_are_the_team(order: tuple[int, ...], reward: str) -> None:
+def test_four_single_robot_environments_equal_the_team(order: tuple[int, ...], reward: str) -> None:
     paths = random_actions(6, 4, (4,))
     with serving(robots=4) as instance:
         env = team(instance=instance, action="path", observation=PARTS, reward=reward)
@@ -209,7 +209,7 @@ def test_four_environments_of_one_robot_are_the_team(order: tuple[int, ...], rew
                 assert_same(list(flown), [part[AGENTS[robot]] for part in outcome])
 
 
-def test_a_late_path_is_not_flown_and_told() -> None:
+def test_a_late_path_is_dropped_and_reported() -> None:
     with serving(robots=2, deadline_ms=50) as instance:
         quick, slow = alone(instance, 0), alone(instance, 1, observation=PARTS)
         quick.reset()
@@ -230,7 +230,7 @@ def test_a_late_path_is_not_flown_and_told() -> None:
         assert info["n_missed"] == 2 and set(np.unique(seen["age"])) == {2, 255}
 
 
-def test_slow_teammates_are_waited_for_beyond_the_timeout(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_step_waits_for_slow_teammates_past_the_timeout(caplog: pytest.LogCaptureFixture) -> None:
     with serving(robots=2) as instance:
         patient, slow = alone(instance, 0), alone(instance, 1)
         patient.reset()
@@ -248,7 +248,7 @@ def test_slow_teammates_are_waited_for_beyond_the_timeout(caplog: pytest.LogCapt
         assert first[4]["n_visited"] > 0 and second[4]["n_visited"] > 0
 
 
-def test_keywords_that_fit_no_team_of_a_server_are_named() -> None:
+def test_keywords_that_do_not_fit_a_servers_team_are_named() -> None:
     of_one = "expected worlds of one robot, as options are planned for one"
     with serving(robots=3) as instance:
         rows: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
@@ -271,7 +271,7 @@ def test_keywords_that_fit_no_team_of_a_server_are_named() -> None:
         make_vec(3, robots=2)
 
 
-def test_rows_of_a_world_are_reset_together() -> None:
+def test_all_rows_of_a_world_are_reset_together() -> None:
     envs = make_vec(6, robots=3, autoreset_mode="Disabled")
     first, _ = envs.reset(seed=[5, 0, 0, 9, 0, 0])
     assert_same(envs.reset(seed=[5, 1, 1, 9, 2, 2])[0], first)

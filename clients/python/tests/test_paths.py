@@ -67,7 +67,7 @@ def filled(folder: Path) -> Path:
     return folder
 
 
-def test_worlds_come_from_any_folder_in_any_locale(tmp_path: Path) -> None:
+def test_worlds_load_from_any_folder_in_any_locale(tmp_path: Path) -> None:
     folder = filled(tmp_path / "fire \xe9")
     with serving() as instance:
         for locale in (PLAIN, STRICT):
@@ -102,7 +102,7 @@ def imported(locale: dict[str, str], *files: tuple[Path, Path]) -> list[tuple[in
 
 
 @pytest.mark.parametrize("locale", [PLAIN, STRICT], ids=["plain", "strict"])
-def test_rasters_come_from_any_folder_in_any_locale(locale: dict[str, str], tmp_path: Path) -> None:
+def test_rasters_load_from_any_folder_in_any_locale(locale: dict[str, str], tmp_path: Path) -> None:
     folder, latin = tmp_path / "fire \xe9", tmp_path / LATIN
     folder.mkdir(), latin.mkdir()
     np.save(folder / "a.npy", np.where(ARRIVAL == NEVER, np.inf, ARRIVAL))
@@ -122,7 +122,7 @@ def test_rasters_come_from_any_folder_in_any_locale(locale: dict[str, str], tmp_
         assert (code, f": {subject}: {EXPECTED}" in line) == (2, True)
 
 
-def test_other_paths_of_worlds_are_refused_by_name() -> None:
+def test_paths_that_are_not_utf_8_are_refused() -> None:
     with serving() as instance, emberwatch.connect(instance) as client, client.acquire() as lease:
         for name in (LATIN, "a\0b"):
             calls: list[tuple[str, Callable[[], Any]]] = [

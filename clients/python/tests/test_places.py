@@ -16,14 +16,14 @@ from emberwatch.client.client import connect
 US = os.getpid()
 
 
-def test_without_a_server_the_instance_and_the_remedy_are_named() -> None:
+def test_a_missing_server_is_named_with_a_remedy() -> None:
     with pytest.raises(errors.NoServerError) as raised:
         connect("nobody-here")
     assert "'nobody-here'" in str(raised.value)
     assert "emberwatch-server --instance nobody-here" in str(raised.value)
 
 
-def test_a_server_that_is_started_later_is_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+def test_connect_waits_for_a_server_that_starts_later(caplog: pytest.LogCaptureFixture) -> None:
     instance = unused_instance()
     with ThreadPoolExecutor() as threads:
         waiting = threads.submit(connect, instance, wait=PATIENCE)
@@ -36,18 +36,18 @@ def test_a_server_that_is_started_later_is_waited_for(caplog: pytest.LogCaptureF
     assert f"no server on instance {instance!r}" in caplog.text
 
 
-def test_a_wait_for_the_lock_ends_with_its_limit_or_ctrl_c() -> None:
+def test_a_lock_wait_ends_by_timeout_or_ctrl_c() -> None:
     started = server()
     with (CHANNELS / "lock").open("rb+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with fails("channel", match=f"the lock within .*, got it held by pid {US}"):
+        with fails("channel", match=f"the lock within .*, but it is still held by pid {US}"):
             connect(started.instance, timeout=0.01)
         with ctrl_c():
             connect(started.instance)
     started.connect().status()
 
 
-def test_a_stopped_process_in_its_turn_keeps_nobody_waiting() -> None:
+def test_a_stopped_lock_holder_blocks_nobody() -> None:
     code = (
         "import fcntl, os, signal, sys; lock = open(sys.argv[1], 'r+'); "
         "fcntl.flock(lock, fcntl.LOCK_EX); print(flush=True); os.kill(os.getpid(), signal.SIGSTOP)"

@@ -11,7 +11,7 @@ from emberwatch.planning import beam_search
 RNG = np.random.default_rng(3)
 
 
-def test_visited_cells_are_worth_nothing() -> None:
+def test_visited_cells_have_no_value() -> None:
     values, visited = np.zeros((1, 3, 3)), np.zeros((1, 3, 3), np.uint8)
     values[0, 1, 2], values[0, 0, 1], visited[0, 1, 2] = 9.0, 1.0, 255
     paths = beam_search(values, np.array([(1, 1)]), 1, rng=RNG, visited=visited)
@@ -55,7 +55,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_wrong_arguments_of_a_search_are_named() -> None:
+def test_wrong_search_arguments_are_named() -> None:
     right = {"values": np.zeros((1, 2, 2)), "robots": np.zeros((1, 2), int), "n_moves": 1}
     for wrong, words in WRONG:
         with refuses(words):

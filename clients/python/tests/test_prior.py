@@ -24,7 +24,7 @@ simulated_prior(Model.wildfire(), height=64, width=64, burn_in=1 << 40)
 """
 
 
-def test_it_is_that_of_the_agents(tmp_path: Path) -> None:
+def test_the_prior_equals_the_agents(tmp_path: Path) -> None:
     file = tmp_path / "prior.npy"
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in WORLD.items()]
     command = [find("emberwatch-agent"), "prior", "--model=wildfire", *flags, f"--out={file}"]
@@ -37,7 +37,7 @@ def test_it_is_that_of_the_agents(tmp_path: Path) -> None:
         found[:] = 0
 
 
-def test_control_c_ends_it() -> None:
+def test_ctrl_c_ends_the_simulation() -> None:
     process = script(ENDLESS)
     assert process.line() == "begun"
     process.signal(signal.SIGINT)

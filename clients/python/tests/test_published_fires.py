@@ -22,7 +22,7 @@ BOUNDS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("at", "which"), list(enumerate(["all", "tenth", "window"])))
-def test_each_cure_takes_off_what_it_did(at: int, which: str) -> None:
+def test_the_loss_of_each_kind_is_as_measured(at: int, which: str) -> None:
     fires = list(BENCHMARK["recorded"](FIRES / f"fires-{which}.npz"))
     assert len(fires) == 12
     for kind, bounds in BOUNDS.items():
@@ -31,7 +31,7 @@ def test_each_cure_takes_off_what_it_did(at: int, which: str) -> None:
         assert bounds[at] - 0.004 < loss < bounds[at], f"{kind}: {loss}"
 
 
-def test_simulated_fires_are_like_the_published_ones() -> None:
+def test_simulated_fires_resemble_the_published_ones() -> None:
     own = [states for states, _ in BENCHMARK["simulated"]("all", 12, 0)]
     published = [s for s, _ in BENCHMARK["recorded"](FIRES / "fires-all.npz")]
     assert np.array_equal(own[0][0], published[0][0])

@@ -17,7 +17,7 @@ from emberwatch.errors import EmberwatchError, InvalidArgumentError
 
 States = NDArray[np.uint8]
 
-#: Settings that a states file decides.
+#: Settings that a states file sets.
 OF_STATES = dict.fromkeys(("height", "width", "burn_in", "model"))
 
 
@@ -37,7 +37,7 @@ def states(tmp_path: Path, sequences: list[States]) -> Path:
     return path
 
 
-def test_symmetries_and_offsets_are_those_asked_for(states: Path, sequences: list[States]) -> None:
+def test_symmetries_and_offsets_are_applied(states: Path, sequences: list[States]) -> None:
     def first_states(**keywords: Any) -> set[bytes]:
         env: Any = gymnasium.make(WILDFIRE, states=states, n_moves=3, truth=True, **keywords)
         return {env.reset(seed=seed)[1]["truth"].tobytes() for seed in range(1, 33, 2)}
@@ -49,7 +49,7 @@ def test_symmetries_and_offsets_are_those_asked_for(states: Path, sequences: lis
     assert len(turned) == 8 and recorded[0] in turned
 
 
-def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -> None:
+def test_autoreset_follows_the_end_of_a_sequence(states: Path) -> None:
     envs: Any = gymnasium.make_vec(WILDFIRE, num_envs=2, states=states, n_moves=3)
     envs.reset(seed=0)
     ends: list[NDArray[np.bool_]] = []
@@ -62,7 +62,7 @@ def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -
     assert np.sum(ends, axis=0).min() >= 2
 
 
-def test_a_running_server_tells_of_its_recorded_world(states: Path) -> None:
+def test_a_running_server_describes_its_recorded_world(states: Path) -> None:
     with serving(states=states, **OF_STATES) as instance:
         with emberwatch.connect(instance) as client:
             recorded = client.info.recorded_world
@@ -96,7 +96,7 @@ def test_pictures_have_the_colours_of_the_description(states: Path) -> None:
             env.close()
 
 
-def test_moves_are_paid_by_the_description(states: Path) -> None:
+def test_move_rewards_come_from_the_description(states: Path) -> None:
     env: Any = gymnasium.make(MOVES, states=states, n_moves=3, reward="move")
     paths: Any = gymnasium.make(WILDFIRE, states=states, n_moves=3)
     path = [3, 1, 2]
@@ -109,7 +109,7 @@ def test_moves_are_paid_by_the_description(states: Path) -> None:
         assert sum(float(env.step(move)[1]) for move in path) == expected
 
 
-def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
+def test_mismatched_input_is_refused(tmp_path: Path, states: Path) -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"height": 4}, "height: expected to be left out, as the states file decides it"),
         ({"states_offset": 4}, "states_offset: expected 0 to 3"),

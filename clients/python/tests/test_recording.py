@@ -65,7 +65,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "test.recording"
 
 
-def test_a_recording_is_read_in_order_with_its_losses(path: Path) -> None:
+def test_a_recording_is_read_in_order_with_lost_samples(path: Path) -> None:
     first, hidden, last = read(path, GOOD)
     assert isinstance(first.sample, Frame) and isinstance(hidden.sample, Truth)
     assert first.seconds == 1.5 and first.server.n_moves == 4
@@ -81,7 +81,7 @@ def test_a_recording_is_read_in_order_with_its_losses(path: Path) -> None:
     assert list(recording.read(path, world=1)) == []
 
 
-def test_a_cut_or_damaged_recording_is_read_to_its_last_good_record(path: Path) -> None:
+def test_damaged_recordings_are_read_to_the_last_good_record(path: Path) -> None:
     ends = np.cumsum([len(part) for part in PARTS])
     for length in (0, ends[1] + 1, ends[4], len(GOOD) - 1):
         whole = int((ends <= length).sum())
@@ -100,7 +100,7 @@ def test_a_cut_or_damaged_recording_is_read_to_its_last_good_record(path: Path) 
     refused(path, bytes(damaged), f"damaged at byte {offset}: checksum")
 
 
-def test_what_is_no_recording_is_refused(path: Path, tmp_path: Path) -> None:
+def test_files_that_are_not_recordings_are_refused(path: Path, tmp_path: Path) -> None:
     for content, words in (
         (b"PK\3\4 and so on, at length", 'expected it to begin with "EMBERREC", got "PK'),
         (FILE_HEADER + SERVER + frame(0, n_moves=3), "payload bytes: expected 129, got 130"),

@@ -51,7 +51,7 @@ def test_cells_are_squares_of_their_colour() -> None:
     assert pixel(image, 45, 45) == pixel(image, 45, 0) == FIRE
 
 
-def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
+def test_the_path_is_a_line_that_ends_at_the_robot() -> None:
     image = draw()
     assert pixel(image, 40, 20) == DARK  # between the first two cells
     assert pixel(image, 20, 20) == WHITE  # where the path begins
@@ -68,7 +68,7 @@ def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     assert (pixel(image, 40, 20), pixel(image, 20, 80)) == ROBOTS[:2]  # the lines between cells
 
 
-def test_small_cells_are_tinted_where_visited() -> None:
+def test_small_visited_cells_are_tinted() -> None:
     wide = np.full((2, 40), 255, np.uint8)
     wide[0] = 2
     image = draw(frame=wide, robots=[(1, 39)], paths=[[(0, 0), (0, 1)]], scale=2)
@@ -77,7 +77,7 @@ def test_small_cells_are_tinted_where_visited() -> None:
     assert all(t > p for t, p in zip(tinted, plain, strict=True)) and tinted != WHITE
 
 
-def test_the_truth_stands_beside_or_below() -> None:
+def test_the_truth_is_drawn_to_the_right_or_below() -> None:
     image = draw(truth=TRUTH)
     assert image.shape == (80, 120 + 8 + 120, 3)
     assert pixel(image, 5, 128 + 45) == LATENT and pixel(image, 5, 128 + 85) == FIRE
@@ -86,7 +86,7 @@ def test_the_truth_stands_beside_or_below() -> None:
     assert draw(frame=wide, truth=wide, scale=10).shape == (20 + 8 + 20, 60, 3)
 
 
-def test_panels_are_about_512_pixels_and_even() -> None:
+def test_panels_are_about_512_pixels_with_even_sides() -> None:
     for grid, panel, both in (
         ((64, 64), (512, 512), (512, 1032)),
         ((7, 5), (518, 370), (518, 748)),
@@ -112,7 +112,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_mismatched_input_is_refused() -> None:
     for changes, expected in WRONG:
         for picture in (draw, text):
             with pytest.raises(ValueError, match=expected):
@@ -121,7 +121,7 @@ def test_what_does_not_fit_is_refused() -> None:
         draw(scale=0)
 
 
-def test_a_palette_keeps_grey_and_path_apart_from_the_model() -> None:
+def test_grey_and_path_differ_from_the_models_colours() -> None:
     assert (WILDFIRE.unobserved, WILDFIRE.path) == ((0x30,) * 3, DARK)
     toml = Model.wildfire().toml
     dark = Model.from_toml(re.sub(r"#\w{6}\"", '#202028"', toml))
@@ -143,7 +143,7 @@ def test_ascii_shows_values_path_and_robot() -> None:
     assert text(palette=many, frame=FRAME + np.uint8(10), paths=[]).startswith("A 9 9")
 
 
-def test_colours_are_written_where_they_change() -> None:
+def test_colours_are_written_only_where_they_change() -> None:
     grey, normal = "48;2;48;48;48m", "48;2;59;110;165m"
     first, second = text(color=True).split("\n")
     assert first == f"\x1b[38;2;255;255;255;{normal}··\x1b[38;2;255;255;255;{grey}    \x1b[0m"
@@ -151,7 +151,7 @@ def test_colours_are_written_where_they_change() -> None:
     assert text(color=True, truth=TRUTH).count("()") == 2
 
 
-def test_tall_grids_take_half_the_lines() -> None:
+def test_tall_grids_use_half_lines() -> None:
     tall = np.full((41, 3), 255, np.uint8)
     tall[1] = 2
     lines = text(frame=tall, robots=[(0, 0)], paths=[], color=True).split("\n")
@@ -194,7 +194,7 @@ def test_a_window_shows_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     one.close()
 
 
-def test_a_terminal_shows_the_text_in_place(
+def test_a_terminal_redraws_the_text_in_place(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
@@ -209,7 +209,7 @@ def test_a_terminal_shows_the_text_in_place(
     assert capsys.readouterr().out == shown
 
 
-def test_nowhere_to_show_is_said_once(
+def test_a_missing_screen_is_logged_once(
     caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with caplog.at_level(logging.WARNING):
@@ -224,7 +224,7 @@ def test_nowhere_to_show_is_said_once(
     ]
 
 
-def test_pictures_keep_their_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_are_limited_to_fps(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[float] = []
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setattr("time.sleep", waits.append)

@@ -31,7 +31,7 @@ def cell(image: NDArray[np.uint8], row: int, col: int, left: int = 0) -> NDArray
     return image[top : top + SCALE, left : left + SCALE].reshape(-1, 3)
 
 
-def test_what_was_not_seen_has_the_muted_colour_of_its_zone() -> None:
+def test_unseen_cells_have_the_muted_colour_of_their_zone() -> None:
     plain, image = draw(), draw(**LAND)
     for row, col in np.ndindex(FRAME.shape):
         before, after = (cell(drawn, row, col)[0] for drawn in (plain, image))
@@ -53,7 +53,7 @@ def test_no_fly_cells_are_hatched_in_a_colour_that_stands_out() -> None:
     assert (draw(scale=1, no_fly=NO_FLY) != draw(scale=1)).any(), "in cells of a pixel, too"
 
 
-def test_dots_part_zones_unless_there_are_many() -> None:
+def test_dots_separate_zones_unless_there_are_many() -> None:
     plain, image = draw(truth=True), draw(truth=True, **LAND)
     changed = (plain != image).any(axis=2)[:, 3 * SCALE + GAP :]
     assert set(np.nonzero(changed)[1]) == {2 * SCALE - 1}
@@ -63,7 +63,7 @@ def test_dots_part_zones_unless_there_are_many() -> None:
     assert not changed[:, 3 * SCALE + GAP :].any()
 
 
-def test_a_line_goes_around_what_was_seen_beyond_the_path() -> None:
+def test_a_line_surrounds_cells_seen_beyond_the_path() -> None:
     plain, image = draw(), draw(sees_beyond=True)
     changed = (plain != image).any(axis=2)
     assert changed[:, SCALE].all() and changed[SCALE - 1, 2 * SCALE :].all()

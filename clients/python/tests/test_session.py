@@ -89,7 +89,7 @@ def step(env: Any) -> str | int:
 
 
 @pytest.mark.parametrize("state", OUTCOMES, ids=lambda state: state.value)
-def test_each_state_has_its_calls(env: Any, state: State) -> None:
+def test_each_state_allows_its_calls(env: Any, state: State) -> None:
     for n, call in enumerate((step, resume)):
         rollout(env, 2, seed=1)
         REACHED[state](env)
@@ -106,7 +106,7 @@ def test_each_state_has_its_calls(env: Any, state: State) -> None:
         assert step(env) == 1
 
 
-def test_an_episode_that_is_over_waits_for_the_holder_of_all(started: Server) -> None:
+def test_only_a_holder_of_all_robots_resets_a_finished_world(started: Server) -> None:
     env = make(instance=started.instance, robot=0).unwrapped
     env.reset()
     assert [step(env) for _ in range(3)] == [1, 2, 3]
@@ -126,7 +126,7 @@ def test_a_lone_robot_is_never_late(env: Any) -> None:
     assert [resume(env), step(env)] == [2, 3]
 
 
-def test_a_warning_that_is_an_error_changes_no_state() -> None:
+def test_a_warning_raised_as_an_error_changes_no_state() -> None:
     env = closed_later(gymnasium.make("emberwatch/WildfireSmall-v0").unwrapped)
     env.reset(seed=1000)
     with warnings.catch_warnings(), pytest.raises(TrainingOnTestWorldsWarning):

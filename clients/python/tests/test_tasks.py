@@ -38,7 +38,7 @@ CONFIG = Path(__file__).parents[3] / "config"
 
 TASKS = built_in_tasks()
 
-#: Flags of servers that a task decides.
+#: Flags of a server that a task sets.
 OF_TASKS = dict.fromkeys(("height", "width", "moves", "burn_in", "model"))
 
 
@@ -62,7 +62,7 @@ def by_hand(name: str) -> dict[str, Any]:
     return {key: value for key, value in renamed.items() if key not in not_keywords}
 
 
-def test_the_package_has_the_files_of_the_programs() -> None:
+def test_the_package_contains_the_programs_files() -> None:
     def texts(pattern: str) -> dict[str, str]:
         return {file.stem: file.read_text("utf-8") for file in CONFIG.glob(pattern)}
 
@@ -71,7 +71,7 @@ def test_the_package_has_the_files_of_the_programs() -> None:
     assert built_in("states") == texts("landscapes/*/*.toml")
     for name, task in TASKS.items():
         assert Task.named(name) == Task.named(CONFIG / f"tasks/{name}.toml") == task
-    with refuses("task ash: No such file .*expected one, or wildfire, small, "):
+    with refuses("task ash: No such file .*expected a file, or one of wildfire, small, "):
         Task.named("ash")
     for name, task in TASKS.items():  # ids end episodes with the task
         for kind, n_moves in (("-v0", 1), ("Moves-v0", task.n_moves), ("Objective-v1", 1)):
@@ -88,7 +88,7 @@ def are_same(makers: list[Any], steps: int) -> None:
 
 
 @each(TASKS)
-def test_a_task_is_its_settings_by_hand(name: str) -> None:
+def test_a_task_equals_its_settings_by_hand(name: str) -> None:
     task, hand = TASKS[name], by_hand(name)
     ids, n_rows, n_moves = f"emberwatch/{task.ids}", 2 * task.robots, 2 * task.n_moves
     make, many = gymnasium.make, partial(gymnasium.make_vec, num_envs=n_rows)
@@ -121,7 +121,7 @@ def test_the_team_task_passes_pettingzoo_and_refuses_one_robot() -> None:
         env.close()
 
 
-def test_what_a_task_decides_is_refused_by_name() -> None:
+def test_keywords_set_by_a_task_are_refused() -> None:
     decided: dict[str, Any] = {"model": "wildfire", "states": "jacksboro", "sensor_radius": 1}
     decided |= {"states_symmetries": True, "states_offset": 3, "height": 16, "width": 16}
     decided |= {"n_moves": 16, "robots": 1, "burn_in": 3000, "start": "corner"}
@@ -168,7 +168,7 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_a_running_server_must_run_what_the_task_says(tmp_path: Path, name: str) -> None:
+def test_a_running_server_must_match_the_task(tmp_path: Path, name: str) -> None:
     file = tmp_path / "own.toml"
     text = (CONFIG / f"tasks/{name}.toml").read_text("utf-8").replace(f'"{name}"', '"own"')
     file.write_text(text, "utf-8")
@@ -184,7 +184,7 @@ def test_a_running_server_must_run_what_the_task_says(tmp_path: Path, name: str)
                 gymnasium.make(WILDFIRE, **keywords)
 
 
-def test_a_suite_is_scored_beside_the_programs_policies(tmp_path: Path) -> None:
+def test_a_suite_is_scored_next_to_the_programs_policies(tmp_path: Path) -> None:
     own = (CONFIG / "tasks/small.toml").read_text("utf-8")
     for old, new in {'"small"': '"tiny"', "300": "9", "end = 32": "end = 3"}.items():
         own = own.replace(old, new)
@@ -253,7 +253,7 @@ def test_an_episode_on_a_test_world_warns(own: Path) -> None:
             envs.reset(seed=seed)
 
 
-def test_evaluations_are_on_test_worlds_without_a_warning(own: Path, tmp_path: Path) -> None:
+def test_evaluations_on_test_worlds_do_not_warn(own: Path, tmp_path: Path) -> None:
     def up(seen: Any) -> Any:
         return np.zeros(len(seen), np.int64)
 
@@ -289,7 +289,7 @@ env.close()
 """
 
 
-def test_a_process_is_warned_once_and_not_where_it_is_switched_off() -> None:
+def test_the_warning_appears_once_unless_suppressed() -> None:
     command = [sys.executable, "-c", RESETS]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "by hand\n"), done.stderr
@@ -299,7 +299,7 @@ def test_a_process_is_warned_once_and_not_where_it_is_switched_off() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_trainers_own_seeds_warn(own: Path) -> None:
+def test_seeds_drawn_by_trainers_warn(own: Path) -> None:
     sb3 = pytest.importorskip("stable_baselines3")
     from stable_baselines3.common.env_util import make_vec_env as dummies
 

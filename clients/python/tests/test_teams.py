@@ -15,7 +15,7 @@ def paths(n_robots: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 4, (n_robots, 6))
 
 
-def test_robots_are_numbered_through_all_worlds() -> None:
+def test_robots_are_numbered_across_worlds() -> None:
     started = server(worlds=3, robots=2)
     client = started.connect()
     assert (client.info.n_worlds, client.info.n_robots) == (3, 2)
@@ -33,7 +33,7 @@ def test_robots_are_numbered_through_all_worlds() -> None:
     assert us is not None and holders == [(None, None), (us, us), (us, None)]
 
 
-def test_frames_of_a_team_are_what_its_robots_saw() -> None:
+def test_team_frames_combine_the_robots_frames() -> None:
     lease = server(worlds=2, robots=3).connect().acquire(0, 6)
     answer = lease.step(paths(6))
     expected = answer.frames.reshape(2, 3, 5, 7).min(axis=1)
@@ -50,7 +50,7 @@ def test_frames_of_a_team_are_what_its_robots_saw() -> None:
     assert (flown.frames == lease.observe().frames.reshape(2, 3, 5, 7).min(axis=1)).all()
 
 
-def test_beliefs_are_left_for_each_robot() -> None:
+def test_each_robot_can_leave_a_belief() -> None:
     client = server(robots=2).connect()
     lease = client.acquire(0, 2)
     results = lease.step(paths(2))

@@ -56,7 +56,7 @@ def averages(folder: Path, name: str) -> dict[int, float]:
     return {step: sum(there) / len(there) for step, there in values.items()}
 
 
-def test_a_training_shows_its_metrics_and_beliefs(tmp_path: Path) -> None:
+def test_training_logs_metrics_and_belief_images(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     train(folder, "--steps", 240)
     columns = ["loss", "held_out_log_likelihood", "mean_reward", "rate"]

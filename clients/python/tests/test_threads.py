@@ -64,12 +64,12 @@ print(codes, errors)
 """
 
 
-def test_children_of_a_busy_process_open_their_own() -> None:
+def test_forked_children_open_their_own_connections() -> None:
     ended, out, err = script(FORKS, server(worlds=3).instance).end()
     assert (ended, out) == (0, "{0} []\n"), err
 
 
-def test_a_wait_leaves_the_interpreter_to_other_threads() -> None:
+def test_a_wait_releases_the_interpreter_lock() -> None:
     started = server(robots=2)
     lease, mate = started.connect().acquire(0), started.connect().acquire(1)
     waits = threading.Thread(target=lambda: lease.step([3] * 6))
@@ -78,7 +78,7 @@ def test_a_wait_leaves_the_interpreter_to_other_threads() -> None:
     waits.join()
 
 
-def test_what_is_open_is_not_copied() -> None:
+def test_open_objects_cannot_be_copied() -> None:
     client = server().connect()
     for copied in (pickle.dumps, copy.deepcopy):
         with pytest.raises(TypeError, match="cannot pickle"):
@@ -146,7 +146,7 @@ def test_threads_that_step_one_environment_take_turns(kind: str) -> None:
 
 
 @pytest.mark.parametrize("height", [7, 130])  # 7, and more than 16,384 cells in total
-def test_a_thread_that_watches_reads_masks_and_parts_of_the_path(height: int) -> None:
+def test_another_thread_can_read_masks_and_partial_paths(height: int) -> None:
     envs = make_vec(2, MOVES, height=height, width=height)
     envs.reset(seed=1000)
     flights = envs.unwrapped._flights

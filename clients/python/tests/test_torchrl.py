@@ -24,14 +24,14 @@ from torchrl.envs.utils import check_env_specs
     ],
     ids=str,
 )
-def test_its_environment_of_a_name_finds_no_fault(name: str, keywords: dict[str, Any]) -> None:
+def test_torchrls_environment_checker_passes(name: str, keywords: dict[str, Any]) -> None:
     env = GymEnv(name, **SMALL, **keywords)
     check_env_specs(env, seed=1)
     assert env.rollout(5)["next", "reward"].shape == (5, 1)
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
-def test_its_wrapper_of_a_vector_returns_the_vectors_steps(mode: str) -> None:
+def test_torchrls_wrapper_returns_the_vectors_steps(mode: str) -> None:
     def vector() -> gymnasium.vector.VectorEnv:
         keywords = {"observation": "local", "reward": "move", "max_episode_steps": 6}
         return gymnasium.make_vec(MOVES, 3, autoreset_mode=mode, **SMALL, **keywords)

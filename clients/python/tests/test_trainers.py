@@ -34,7 +34,7 @@ IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY
     ],
     ids=str,
 )
-def test_stable_baselines_finds_no_fault(name: str, keywords: dict[str, Any]) -> None:
+def test_the_stable_baselines_checker_passes(name: str, keywords: dict[str, Any]) -> None:
     with no_warnings():
         env = make(name, **{**IMAGE, **keywords})
         for one in (env.unwrapped, env):
@@ -45,7 +45,7 @@ def test_stable_baselines_finds_no_fault(name: str, keywords: dict[str, Any]) ->
     ("name", "keywords"),
     [(MOVES, {"observation": ("frame", "local")}), (OBJECTIVE, {"prior": "initial"})],
 )
-def test_the_vector_environment_is_that_of_single_ones(name: str, keywords: dict[str, Any]) -> None:
+def test_the_vector_environment_equals_single_ones(name: str, keywords: dict[str, Any]) -> None:
     keywords = {**IMAGE, "max_episode_steps": 6, **keywords}
     ours = make_vec_env(name, 3, **keywords)
     theirs = DummyVecEnv([lambda: make(name, **keywords) for _ in range(3)])
@@ -85,7 +85,7 @@ def test_robots_of_a_world_share_a_policy() -> None:
     assert (row.robots, row.team) == (3, "alone") and row.mean_distinct_cells > 0
 
 
-def test_what_is_no_vector_for_it_is_named() -> None:
+def test_unsuitable_vector_environments_are_refused() -> None:
     with refuses("env: expected an environment of emberwatch from"):
         WildfireVecEnv(gymnasium.make_vec(MOVES, num_envs=2, **IMAGE))
     vector = make_vec_env(MOVES, 2, **IMAGE)

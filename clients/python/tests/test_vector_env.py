@@ -86,7 +86,7 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
     ids=str,
 )
 @pytest.mark.parametrize("mode", AutoresetMode, ids=str)
-def test_every_field_is_that_of_single_environments(
+def test_every_field_equals_that_of_single_environments(
     mode: AutoresetMode, name: str, keywords: dict[str, Any]
 ) -> None:
     n_steps, truth = 10 if name == MOVES else 3, mode is not AutoresetMode.SAME_STEP
@@ -113,7 +113,7 @@ def test_every_field_is_that_of_single_environments(
 
 
 @by_name
-def test_worlds_of_running_servers_are_the_same_too(name: str) -> None:
+def test_worlds_of_running_servers_are_the_same(name: str) -> None:
     # The servers truncate by themselves, and the vector's worlds begin at the server's world 2.
     flags = {"publish_truth": True, "max_steps": 3}
     with serving(worlds=5, seed=40, **flags) as one, serving(worlds=3, seed=9, **flags) as other:
@@ -128,7 +128,7 @@ def test_worlds_of_running_servers_are_the_same_too(name: str) -> None:
         assert holders == [(None,), (None,), (pid,), (pid,), (pid,)]
 
 
-def test_seeds_are_those_of_single_environments() -> None:
+def test_seeds_work_as_in_single_environments() -> None:
     ours, theirs = pair(3, AutoresetMode.NEXT_STEP, truth=True)
     for seed in (0, 2**40, [5, None, 0], (1, 2, 3), None, np.int64(4)):
         plain = int(seed) if isinstance(seed, np.integer) else seed
@@ -138,7 +138,7 @@ def test_seeds_are_those_of_single_environments() -> None:
             assert_same(ours.reset(), theirs.reset(), repr(seed))
 
 
-def test_a_reset_mask_is_left_as_it_was() -> None:
+def test_a_reset_mask_is_not_changed() -> None:
     env = make_vec(2)
     with pytest.raises(gymnasium.error.ResetNeeded, match="all worlds in the first reset"):
         env.reset(options={"reset_mask": np.array([True, False])})
@@ -150,7 +150,7 @@ def test_a_reset_mask_is_left_as_it_was() -> None:
     assert options["reset_mask"].tolist() == [True, False]
 
 
-def test_resume_goes_on_where_the_worlds_stand() -> None:
+def test_resume_continues_the_current_episodes() -> None:
     with serving(worlds=3) as instance:
         first = make_vec(3, instance=instance, observation=PARTS)
         first.reset(seed=1)
@@ -190,7 +190,7 @@ def spoil(value: Any) -> None:
 
 @by_name
 @pytest.mark.parametrize("mode", [*AutoresetMode, None], ids=str)
-def test_what_was_returned_is_never_changed_and_may_be_written_to(
+def test_returned_arrays_are_writable_and_never_change(
     mode: AutoresetMode | None, name: str
 ) -> None:
     """Covers vectors in each mode, and single environments."""
@@ -231,7 +231,7 @@ def test_the_registry_sets_spec_and_metadata() -> None:
     assert_same(again.reset(seed=1), env.reset(seed=1))
 
 
-def test_the_registrys_time_limit_holds_unless_another_is_given() -> None:
+def test_the_registrys_time_limit_is_the_default() -> None:
     def n_steps_of(**keywords: Any) -> int:
         env = make_vec(1, **keywords)
         env.reset(seed=1)
@@ -253,7 +253,7 @@ def test_vector_wrappers_work() -> None:
     assert [info["step"] for info in recorder.reset(seed=1)[1]] == [0, 0]
 
 
-def test_pictures_are_those_of_single_environments() -> None:
+def test_pictures_equal_those_of_single_environments() -> None:
     name = WILDFIRE
     keywords = {**ALL[name], "render_mode": "rgb_array", "truth": True, "max_episode_steps": 3}
     ours, theirs = pair(3, AutoresetMode.NEXT_STEP, name=name, **keywords)
@@ -282,7 +282,7 @@ def test_texts_and_windows_are_shown() -> None:
 
 
 @by_name
-def test_a_takeover_of_one_world_is_told_to_all(name: str) -> None:
+def test_a_takeover_of_one_world_ends_the_whole_lease(name: str) -> None:
     with serving(worlds=3) as instance:
         env = make_vec(3, name, instance=instance)
         env.reset(seed=1)

@@ -96,7 +96,7 @@ def test_a_result_is_laid_out_as_documented() -> None:
         assert [*kind._fields] == list(fields)
 
 
-def test_every_status_has_a_refusal_with_its_name_code_and_detail() -> None:
+def test_every_status_has_an_error_with_name_code_and_detail() -> None:
     ok, *refusals = document.table("| status | code |")
     assert (ok[:2], _native.explain(0, 0)) == (["ok", "0"], None)
     for name, status, detail, *_ in refusals:
@@ -110,7 +110,7 @@ def test_every_status_has_a_refusal_with_its_name_code_and_detail() -> None:
     assert "24" in str(error)
 
 
-def test_limits_and_values_are_the_documented_ones() -> None:
+def test_limits_and_values_match_the_document() -> None:
     limits = document.limits()
     assert wire.TRUTH_BUFFER == limits["TRUTH_BUFFER"]
     assert (_native.MAX_MOVES, _native.MAX_SIDE) == (limits["MAX_MOVES"], limits["MAX_SIDE"])
@@ -124,7 +124,7 @@ def test_limits_and_values_are_the_documented_ones() -> None:
     assert f"**{wire.UNOBSERVED} where nothing was" in document.PROTOCOL
 
 
-def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
+def test_the_worked_answer_parses_to_its_annotations() -> None:
     message, values = document.worked_example("StepReply")
     reply = LAYOUTS["StepReply"]
     numbers = struct.unpack_from(reply.format, message)
@@ -156,7 +156,7 @@ def presented(*answer: Any) -> wire.StepAnswer:
     return wire.StepAnswer(_native.Answer(2, 3, 5, *answer))
 
 
-def test_an_answer_can_be_copied_pickled_and_shown_in_short() -> None:
+def test_answers_can_be_copied_pickled_and_printed() -> None:
     for answer in (answered(), answered(4, flags=wire.TEAM_FRAMES)):
         for other in (copy.deepcopy(answer), pickle.loads(pickle.dumps(answer))):
             assert repr(other) == repr(answer) and (other.frames == answer.frames).all()
@@ -169,7 +169,7 @@ def test_an_answer_can_be_copied_pickled_and_shown_in_short() -> None:
     assert repr(answered(4)).endswith("n_moves=0)), and 3 more])") and len(repr(answered(4))) < 500
 
 
-def test_the_documented_requests_are_what_a_client_sends() -> None:
+def test_a_client_sends_the_documented_requests() -> None:
     def sent(call: Any, reply: object = replies("done")[0]) -> dict[str, Any]:
         wired.say(reply)
         call()
@@ -195,7 +195,7 @@ def test_the_documented_requests_are_what_a_client_sends() -> None:
     assert asked[0]["op"] == "hello" and got == others
 
 
-def test_a_refusal_is_in_the_words_of_python() -> None:
+def test_errors_name_the_python_keyword() -> None:
     (error,) = replies("error")
     message = error["message"].replace('"takeover": true', "takeover=True")
     assert str(errors.refusal(10, error["detail"], error["message"])) == message
@@ -214,7 +214,7 @@ NO_LAND: list[tuple[str, Any]] = [
 ]
 
 
-def test_land_that_no_grid_has_is_a_bad_answer() -> None:
+def test_land_that_does_not_fit_the_grid_is_a_bad_answer() -> None:
     for key, change in NO_LAND:
         told = {**LANDED[key], **change} if change else change
         with fails("bad_answer", "'airspace' and 'zones' of the grid"):
@@ -236,7 +236,7 @@ def test_a_record_has_every_documented_key() -> None:
     assert record(ServerInfo, unknown) == record(ServerInfo, HELLO | LANDED)
 
 
-def test_replies_that_make_no_sense_are_refused() -> None:
+def test_malformed_replies_are_refused() -> None:
     world = {"world": 0, "step": 0, "seed": None, "episode": 0, "robots": [[0, 0]]}
     granted = {"lease": 1, "ttl_millis": 1, "worlds": []}
     for reply in (
@@ -252,7 +252,7 @@ def test_replies_that_make_no_sense_are_refused() -> None:
             Wired(**{name: {}})
 
 
-def test_the_worked_example_is_what_a_server_answers() -> None:
+def test_a_server_answers_as_in_the_worked_example() -> None:
     flags = re.search(r"^`emberwatch-server (.*?)`, then hello", document.PROTOCOL, re.MULTILINE)
     assert flags
     pairs = re.findall(r"--(\S+) (\S+)", flags[1])

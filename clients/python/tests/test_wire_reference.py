@@ -12,7 +12,7 @@ sys.path.append(str(Path(__file__).parents[3] / "tests"))
 wire_reference = pytest.importorskip("wire_reference", exc_type=ImportError)
 
 
-def test_its_layouts_are_the_documents() -> None:
+def test_its_layouts_match_the_document() -> None:
     layouts = document.layouts()
     for name, (layout, fields) in wire_reference.LAYOUTS.items():
         expected = layouts[name]

@@ -57,7 +57,7 @@ def test_a_refusal_in_a_worker_keeps_its_code_and_detail() -> None:
         assert raised.value.code == "lease_lost" and raised.value.detail > 0
 
 
-def test_an_error_made_again_is_the_same() -> None:
+def test_a_recreated_error_is_the_same() -> None:
     for error in (
         errors.LeaseLostError("lost", detail=3),
         errors.RequestTimeoutError("late"),
@@ -69,7 +69,7 @@ def test_an_error_made_again_is_the_same() -> None:
             assert (again.code, again.detail) == (error.code, error.detail)
 
 
-def test_no_line_of_a_traceback_has_a_percent_sign() -> None:
+def test_no_traceback_line_has_a_percent_sign() -> None:
     # `AsyncVectorEnv` formats the traceback with `%`, so a percent sign would hide the error.
     raised = [PACKAGE / "envs", PACKAGE / "client"]
     for path in [*PACKAGE.glob("*.py"), *(it for folder in raised for it in folder.rglob("*.py"))]:

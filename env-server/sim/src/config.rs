@@ -99,7 +99,8 @@ pub enum ConfigError {
         expected: String,
         got: String,
     },
-    /// A setting given by name ([`ServerConfig::with`]) that is unknown, invalid or not allowed here.
+    /// A setting given by name ([`ServerConfig::with`]) that is unknown or invalid, or that a task or a states file
+    /// determines.
     #[error("{setting}: expected {expected}, got {got}")]
     Given {
         setting: String,
@@ -155,7 +156,8 @@ impl Default for ServerConfig {
 impl ServerConfig {
     /// Checks every setting and loads the files that they name.
     ///
-    /// A task replaces every setting that shapes the worlds; a states file replaces model, grid and burn-in.
+    /// A task replaces every setting that shapes the worlds. A states file replaces the model, the grid and the
+    /// burn-in.
     pub fn check(mut self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
         let task = self.take_task()?;
@@ -270,7 +272,7 @@ impl ServerConfig {
         toml::from_str(&text).map_err(|error| wrong(&error))
     }
 
-    /// Reads the states file and replaces the settings that it decides: grid, burn-in and model.
+    /// Reads the states file and replaces the settings that it determines: grid, burn-in and model.
     fn read_states(&mut self) -> Result<(Model, CheckedStates), ConfigError> {
         let file = StatesFile::named(&self.states)?;
         (self.height, self.width) = file.shape.dim();
@@ -301,7 +303,7 @@ impl ServerConfig {
             // The path may be a mistyped name of a built-in model.
             ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
                 let names = listed(Model::built_in_names());
-                let problem = format!("{problem}: expected one, or {names}");
+                let problem = format!("{problem}: expected a file, or one of {names}");
                 file_error("model file", path, problem)
             }
             ModelError::File { path: of, problem } if Path::new(&of) == path => {
@@ -336,7 +338,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_documented_file_holds_the_defaults() {
+    fn the_documented_file_contains_the_defaults() {
         let text = include_str!("../../../config/server.toml");
         let read: ServerConfig = toml::from_str(text).expect("settings");
         assert_eq!(read, ServerConfig::default());

@@ -1,4 +1,4 @@
-//! Worlds inside a process that is their only client. They answer a server's requests without channels.
+//! Worlds inside a process that is their only client. They answer the same requests as a server, but without channels.
 //!
 //! Background threads reset worlds and read and write files, so that a caller can stop waiting for them early.
 
@@ -29,7 +29,7 @@ use std::time::{Duration, Instant};
 /// The instance name in errors. No server can have this name.
 pub const INSTANCE: &str = "(embedded)";
 
-/// Maximum number of queued file jobs. Each holds a whole snapshot in memory.
+/// Maximum number of queued file jobs. Each job keeps a whole snapshot in memory.
 const MAX_FILES: usize = 16;
 
 /// How often a waiting call checks for an interrupt.
@@ -45,7 +45,8 @@ pub struct Embedded {
     resets: (Sender<Reset>, Receiver<Reset>),
     /// Separate from the simulator's threads, so that steps do not wait for resets.
     reset_threads: ThreadPool,
-    /// One thread: of two snapshots written to the same file, the later one remains.
+    /// A pool of one thread, so that jobs run in order: if two snapshots are written to the same file, the later one
+    /// remains.
     file_thread: ThreadPool,
     n_files: Arc<AtomicUsize>,
     info: ServerInfo,
@@ -187,8 +188,8 @@ impl Embedded {
     }
 }
 
-/// Answers requests as a server does. `control_text` can also be interrupted, and after a `shutdown` request every call
-/// fails with [`ConnectionError::ServerGone`].
+/// Answers requests as a server does. In addition, `control_text` can be interrupted. After a `shutdown` request, every
+/// call fails with [`ConnectionError::ServerGone`].
 impl Backend for Embedded {
     fn info(&self) -> &ServerInfo {
         &self.info
@@ -265,7 +266,7 @@ impl Drop for Embedded {
 /// Receives a value from another thread, for at most `timeout` after `start`.
 ///
 /// # Errors
-/// [`ConnectionError::Timeout`] if the time is over or the sender is gone, or the interrupt's error.
+/// [`ConnectionError::Timeout`] if the time is over or the sender was dropped, or the error of the interrupt.
 pub fn wait_for<T>(
     receiver: &Receiver<T>,
     start: Instant,

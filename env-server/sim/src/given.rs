@@ -1,4 +1,5 @@
-//! Settings given by name, from flags or from a program. Each replaces the value of the settings file or the default.
+//! Settings given by name, from flags or from a program. Each one replaces the value in the settings file, or the
+//! default.
 
 use crate::bounds::BOUNDS;
 use crate::config::{ConfigError, ServerConfig};
@@ -8,10 +9,10 @@ use emberwatch_model::task::{Start, Task};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-/// Settings that a states file decides.
+/// Settings that a states file determines.
 const OF_STATES: [&str; 4] = ["model", "height", "width", "burn_in"];
 
-/// Settings that a task decides.
+/// Settings that a task determines.
 const OF_TASK: [&str; 12] = [
     "model",
     "sensor_radius",
@@ -28,11 +29,11 @@ const OF_TASK: [&str; 12] = [
 ];
 
 impl ServerConfig {
-    /// Returns these settings with some replaced. The keys are the names in `config/server.toml`; `start` may also be a
-    /// text such as `3,5`.
+    /// Returns a copy of these settings with the values in `given`. Its keys are the names in `config/server.toml`.
+    /// `start` may also be a text such as `3,5`.
     ///
     /// # Errors
-    /// If a name is unknown, a value is invalid, or a task or recorded states decide the setting.
+    /// If a name is unknown, a value is invalid, or a task or recorded states determine the setting.
     pub fn with(&self, given: &Map<String, Value>) -> Result<Self, ConfigError> {
         let mut settings = self.values();
         for (name, value) in given {
@@ -54,7 +55,8 @@ impl ServerConfig {
     }
 }
 
-/// Returns a setting's value if it has the type of the default and is within bounds, and otherwise what was expected.
+/// Returns a setting's value if it has the type of the default and is within bounds. Otherwise returns the text that
+/// follows "expected" in the error.
 fn check(name: &str, value: &Value, default: Option<&Value>) -> Result<Value, String> {
     let fits = match (name, default) {
         (_, None) => {
@@ -141,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn each_number_has_bounds_that_hold_its_default() {
+    fn each_numeric_setting_has_bounds_that_include_its_default() {
         let defaults = ServerConfig::default().values();
         let numbers = defaults.iter().filter(|(_, value)| value.is_number());
         assert_eq!(numbers.clone().count(), BOUNDS.len());

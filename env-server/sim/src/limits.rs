@@ -24,13 +24,14 @@ pub fn n_threads(config: &ServerConfig) -> usize {
 pub fn start(pool: ThreadPoolBuilder, n_threads: usize) -> Result<ThreadPool, NoThreads> {
     let started = pool.num_threads(n_threads).build();
     let pool = started.map_err(|error| NoThreads::new(n_threads, &error))?;
-    // A thread's first allocation reserves address space. It must happen before `check_memory` measures what is left.
+    // A thread's first allocation reserves address space. It must happen before `check_memory` measures the free
+    // address space.
     pool.broadcast(|_| drop(std::hint::black_box(Box::new(0_u8))));
     Ok(pool)
 }
 
-/// Checks that there is memory for all worlds, for the `n_threads` worlds that may be in a reset at once, and for the
-/// longest answer. Call it after these threads have started.
+/// Checks that there is memory for all worlds, for the `n_threads` worlds that may be reset at the same time, and for
+/// the longest answer. Call it after these threads have started.
 ///
 /// # Errors
 /// If there is too little memory.
@@ -52,7 +53,8 @@ pub fn answer_bytes(checked: &Checked) -> usize {
     config.worlds as usize * (WORLD_BYTES + config.robots as usize * (ROBOT_BYTES + n_cells))
 }
 
-/// Returns an upper bound on the memory of a world, in bytes: its states now and at k = 0, its robots and its history.
+/// Returns an upper bound on the memory of a world, in bytes: its current states, its states at k = 0, its robots and
+/// its history.
 fn bytes_of_world(checked: &Checked) -> usize {
     let (config, n_cells) = (&checked.config, checked.shape.n_cells());
     let sensor = checked.model.file().sensor.as_ref();

@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn results_that_stand_for_no_outcome_are_refused() {
+    fn results_with_invalid_values_are_refused() {
         let (mut robot, mut world) = (RobotResult::default(), WorldResult::default());
         (robot.coverage, robot.start_col) = (2, 4);
         let outcome = robot_outcome(&robot).expect("full coverage");

@@ -1,7 +1,8 @@
 //! States files: recorded hidden states as NumPy arrays, with a description. See docs/recorded-worlds.md.
 //!
-//! An array's header is checked before its values are read or decompressed. Memory grows with the bytes that are
-//! present, not with the size that a header claims, and the values of an array are not copied after they were read.
+//! An array's header is checked before its values are read or decompressed. The allocated memory grows with the bytes
+//! that are present, not with the size that a header claims. The values of an array are not copied after they were
+//! read.
 
 use emberwatch_model::built_in::STATES;
 use emberwatch_model::grid::Shape;
@@ -20,7 +21,8 @@ use zip::ZipArchive;
 /// Maximum size of all arrays together: 4 GiB.
 pub const MAX_BYTES: u64 = 1 << 32;
 
-/// Maximum length of an array's header. NumPy writes 128 bytes; a long one could overflow the parser's stack.
+/// Maximum length of an array's header. NumPy writes 128 bytes. Nested brackets in a long header could overflow the
+/// parser's stack.
 const MAX_HEADER_BYTES: usize = 512;
 
 /// Maximum length of the end record of a zip archive: 22 bytes and a comment.
@@ -67,12 +69,13 @@ impl StatesFile {
         }
     }
 
-    /// Returns the name and the description's text of each of the built-in recorded states.
+    /// Returns the name and the description, as text, of each of the built-in recorded states.
     pub fn built_in_descriptions() -> impl Iterator<Item = (&'static str, &'static str)> {
         STATES.iter().map(|(name, _, text)| (*name, *text))
     }
 
-    /// Reads a `.npz` or `.npy` file with its description next to it, or a folder that holds such files and one.
+    /// Reads a `.npz` or `.npy` file with its description next to it, or a folder that contains such files and one
+    /// description.
     pub fn read(path: &Path) -> Result<Self, StatesError> {
         read(path).map_err(|problem| StatesError {
             path: path.display().to_string(),
@@ -300,8 +303,9 @@ fn check_regular(path: &Path) -> Result<u64, String> {
     }
 }
 
-/// Reads the number of entries from the end record of an archive. `ZipArchive` keeps only one entry per name, so
-/// duplicate names show as a difference. Returns `None` if there is no end record or its 16-bit count is saturated.
+/// Reads the number of entries from the end record of an archive. `ZipArchive` keeps only one entry per name, so its
+/// number of entries is smaller if names are duplicated. Returns `None` if there is no end record or its 16-bit count
+/// is saturated.
 fn n_entries(archive: &mut (impl Read + Seek)) -> std::io::Result<Option<usize>> {
     let n_bytes = archive.seek(SeekFrom::End(0))?;
     archive.seek(SeekFrom::Start(n_bytes.saturating_sub(MAX_ZIP_END_BYTES)))?;

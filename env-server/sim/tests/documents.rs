@@ -41,7 +41,7 @@ fn every_task_has_its_row() {
             "| `{name}` | `{ids}` | `{world}` | {shape} | {moves} | {steps} | {first} to {last} |"
         )
     });
-    // The third column has words after the model or the states. The sixth says "up to" for recorded episodes.
+    // In the third column, words follow the model or the states. The sixth says "up to" for recorded episodes.
     let documented = rows("| task | ids begin with |").into_iter().map(|row| {
         let mut cells: Vec<&str> = row.split(" | ").collect();
         let world = cells[2].split_inclusive('`').take(2).collect::<String>();

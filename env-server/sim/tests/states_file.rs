@@ -161,7 +161,7 @@ fn broken_arrays_are_refused_each_by_its_problem() {
         let start = &bytes[..10 + header.len()];
         let n_bytes = start.len() as u64 + n_values;
         let added = Sequences::new(3).add_array("one", n_bytes, start.chain(Broken));
-        added.expect_err("the values break off")
+        added.expect_err("the values are cut short")
     };
     let header = |from: &str, to: &str| HEADER.replace(from, to);
     assert!(read("lab.npy", &npy_with(HEADER)).is_ok());
@@ -217,7 +217,7 @@ fn broken_archives_are_refused_each_by_its_problem() {
     while let Some(at) = twice.windows(7).position(|name| name == b"two.npy") {
         twice[at..at + 7].copy_from_slice(b"one.npy");
     }
-    // Two members that claim 3 GiB each but hold less: claimed sizes must not be allocated.
+    // Two members claim 3 GiB each but contain less: claimed sizes must not be allocated.
     let header = HEADER.replace("(2, 3, 4)", "(196608, 128, 128)");
     let bytes = npy_with(&header);
     let claimed = (3_u32 << 30) + 10 + header.len() as u32;

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result};
 use std::io::Write;
 
-/// Prints a text; a failure is an error, not a panic.
+/// Prints a text. Unlike `print!`, returns an error instead of panicking if this fails.
 pub fn print(text: &str) -> Result<()> {
     std::io::stdout()
         .write_all(text.as_bytes())

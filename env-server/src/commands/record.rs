@@ -62,7 +62,7 @@ fn report(summary: &RecordSummary) {
         tracing::warn!(
             frames = totals.n_lost_frames,
             truths = totals.n_lost_truths,
-            "samples were lost: they came faster than they could be read"
+            "samples were lost: they arrived faster than they could be read"
         );
     }
     if summary.n_unknown > 0 {

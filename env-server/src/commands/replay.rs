@@ -33,7 +33,7 @@ pub struct ReplayCommand {
     strict: bool,
 }
 
-/// Speed relative to the recording; `None`: as fast as observers can follow.
+/// Speed relative to the recording. `None` means as fast as observers can follow.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Speed(Option<f64>);
 

@@ -36,7 +36,7 @@ struct Target {
     json: bool,
 }
 
-/// The answer to `status`, with the name of the worlds' task, if any.
+/// The answer to `status`, and the name of the task that defines the worlds, if any.
 #[derive(Serialize)]
 struct NamedStatus<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -62,7 +62,7 @@ impl StatusCommand {
 }
 
 impl StopCommand {
-    /// Asks the server to stop, and returns when it has confirmed.
+    /// Asks the server to stop, and waits for its confirmation.
     pub fn run(&self) -> Result<()> {
         self.target.ask(&Request::Shutdown {}).map(|_| ())
     }

@@ -24,12 +24,12 @@ pub struct SnapshotCommand {
     /// The first world to write
     #[arg(long, default_value_t = 0)]
     first_world: u32,
-    /// Number of worlds to write [default: all from the first on]
+    /// Number of worlds to write [default: the first world and all later ones]
     #[arg(long)]
     worlds: Option<u32>,
 }
 
-/// Replaces worlds of a server by worlds from a file.
+/// Replaces worlds of a server with worlds from a file.
 #[derive(Args)]
 pub struct RestoreCommand {
     /// The file to read
@@ -43,7 +43,7 @@ pub struct RestoreCommand {
     /// The first of the file's worlds to read
     #[arg(long, default_value_t = 0)]
     from: u32,
-    /// Number of worlds to read [default: all of the file from the first on]
+    /// Number of worlds to read [default: the first of them and all later ones in the file]
     #[arg(long)]
     worlds: Option<u32>,
     /// Take over robots that other clients hold
@@ -51,7 +51,7 @@ pub struct RestoreCommand {
     takeover: bool,
 }
 
-/// Replaces a world by a copy of another world.
+/// Replaces a world with a copy of another world.
 #[derive(Args)]
 pub struct ForkCommand {
     /// The world to copy

@@ -3,7 +3,7 @@
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use std::time::{Duration, Instant};
 
-/// Maximum number of samples published without a pause. Two bursts fit an observer's buffer.
+/// Maximum number of samples published without a pause. Two bursts fit into an observer's buffer.
 const BURST: usize = FRAME_BUFFER / 2;
 
 /// Minimum time between the beginnings of two bursts: observers poll every 500 us, and the machine may be busy.
@@ -34,13 +34,14 @@ impl Pace {
         self.round_began = now;
     }
 
-    /// Returns when this time of the recording is due, or `None` if that is too late to represent.
+    /// Returns the time at which this time of the recording is due, or `None` if it is too late to represent.
     pub fn due(&self, time: Duration) -> Option<Instant> {
         let after = Duration::try_from_secs_f64(time.as_secs_f64() / self.speed).ok()?;
         self.round_began.checked_add(after)
     }
 
-    /// Returns until when the next sample must wait, so that observers can follow, or `None` if it need not wait.
+    /// Returns the time until which the next sample must wait so that observers can follow, or `None` if it need not
+    /// wait.
     pub fn pause(&self) -> Option<Instant> {
         (self.n_in_burst == BURST).then(|| self.burst_began + BURST_TIME)
     }
@@ -59,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_moment_comes_after_its_recorded_time_divided_by_the_speed() {
+    fn a_sample_is_due_at_its_recorded_time_divided_by_the_speed() {
         let now = Instant::now();
         let due = |speed, seconds| {
             let due = Pace::new(speed, now).due(Duration::from_secs(seconds))?;
@@ -77,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_than_a_burst_comes_in_the_time_of_one() {
+    fn at_most_one_burst_is_published_per_burst_time() {
         let began = Instant::now();
         let mut pace = Pace::new(None, began);
         for _ in 0..BURST {
@@ -92,7 +93,7 @@ mod tests {
         assert_eq!(
             pace.pause(),
             Some(late + BURST_TIME),
-            "counted from the burst's beginning"
+            "measured from the beginning of the burst"
         );
     }
 }

@@ -3,7 +3,7 @@
 //! One thread reads the channels without delay; another compresses and writes. Gaps in the sequence numbers reveal lost
 //! samples, whose number is stored in each record and in the end record.
 //!
-//! A frame of 64 x 64 cells with its path of 64 moves takes about 150 bytes in a file, its hidden states 650.
+//! In a file, a frame of 64 x 64 cells with its path of 64 moves takes about 150 bytes, and its hidden states take 650.
 
 use anyhow::{Context, Result};
 use emberwatch_protocol::Connection;
@@ -31,7 +31,7 @@ const TICK: Duration = Duration::from_millis(50);
 /// Time between flushes, so that every record reaches the operating system within a second.
 const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Maximum wait for the answer to `hello`. A server that does not answer does not publish either.
+/// Maximum wait for the answer to `hello`. A server that does not answer publishes nothing either.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Pause before another `hello` to a server that did not answer.
@@ -53,9 +53,9 @@ pub struct RecordOptions {
     pub overwrite: bool,
     /// Whether to record hidden states, where the server publishes them.
     pub truth: bool,
-    /// Number of world steps to record; 0: no limit.
+    /// Number of world steps to record, or 0 for no limit.
     pub n_steps: u64,
-    /// The worlds to record; empty: all.
+    /// The worlds to record. If empty, all worlds are recorded.
     pub worlds: Vec<u32>,
 }
 
@@ -106,7 +106,8 @@ pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummar
     while !stop.load(Ordering::Relaxed) && recorder.wants_more() {
         recorder.run_once(&frames, truths.as_ref(), TICK)?;
     }
-    // Reads what was published before the stop: at most one buffer, because the server may keep publishing.
+    // Reads the samples that were published before the stop, but at most one buffer of them, because the server may
+    // keep publishing.
     for _ in 0..FRAME_BUFFER {
         if !recorder.wants_more() || !recorder.run_once(&frames, truths.as_ref(), Duration::ZERO)? {
             break;
@@ -127,7 +128,7 @@ struct Recorder<'a> {
     silent: Option<(u32, Instant)>,
     frames: Channel,
     truths: Channel,
-    /// Episode and step of each world's latest frame, because frames may be published repeatedly.
+    /// Episode and step of each world's latest frame, needed because frames may be published repeatedly.
     steps: HashMap<u32, (u64, u64)>,
     n_steps: u64,
     n_unknown: u64,
@@ -151,7 +152,8 @@ impl Recorder<'_> {
         }
     }
 
-    /// Waits for a frame, and records it after the hidden states published before it. Returns whether one came.
+    /// Waits for a frame, and records it after the hidden states that were published before it. Returns whether a frame
+    /// arrived.
     fn run_once(
         &mut self,
         frames: &Observer<FrameHeader>,
@@ -339,7 +341,7 @@ impl Writing {
         })
     }
 
-    /// Queues a record. Waits while the queue is full, during which the observer may lose samples; they are counted.
+    /// Queues a record. Waits while the queue is full. The observer may lose samples meanwhile, which are counted.
     fn push(&self, record: Record) {
         while self.n_queued_bytes.load(Ordering::Relaxed) > MAX_QUEUED_BYTES && self.is_running() {
             std::thread::sleep(Duration::from_millis(1));
@@ -395,7 +397,7 @@ fn bytes_of(record: &Record) -> usize {
         }
 }
 
-/// Creates the file, readable only by its owner because it may hold hidden states.
+/// Creates the file, readable only by its owner because it may contain hidden states.
 fn create(path: &Path, overwrite: bool) -> std::io::Result<File> {
     let mut file_options = OpenOptions::new();
     file_options.write(true).mode(0o600);

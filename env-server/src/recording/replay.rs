@@ -3,9 +3,9 @@
 //! The file is read twice: first to check it completely before anything is published, then to publish it.
 //!
 //! By default a replay begins with the first observer and keeps the recorded timing. At any speed it publishes at most
-//! 64 samples within a millisecond, so an observer that polls every 500 us loses none. Nothing is published twice: an
-//! observer that comes late sees each world from its next sample on. At its end, a replay waits up to 3 s for its
-//! observers to leave. When a replay repeats, sequence numbers start again, as with a new server.
+//! 64 samples within a millisecond, so an observer that polls every 500 us loses none. Nothing is published twice: a
+//! late observer receives each world from its next sample on. At its end, a replay waits up to 3 s for its observers to
+//! leave. When a replay repeats, sequence numbers start again, as with a new server.
 
 use super::pace::Pace;
 use super::replies::{ConnectionCounts, Next, ReplayState};
@@ -35,7 +35,7 @@ pub struct ReplayOptions {
     pub file: PathBuf,
     /// The instance to publish on.
     pub instance: Instance,
-    /// Speed relative to the recording; `None`: as fast as observers can follow.
+    /// Speed relative to the recording. `None` means as fast as observers can follow.
     pub speed: Option<f64>,
     /// Length of the beginning to skip.
     pub from: Duration,
@@ -79,7 +79,7 @@ pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
     outcome
 }
 
-/// Message sizes, first server and totals of the whole file.
+/// The message sizes, the first server and the totals of the whole file.
 struct RecordingSummary {
     config: PortConfig,
     /// The first server in the file.

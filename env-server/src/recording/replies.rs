@@ -1,4 +1,5 @@
-//! Replies to the clients of a replay: the recorded server's answer to `hello`, and the worlds as last published.
+//! Replies to the clients of a replay: the recorded server's answer to `hello`, and the last published state of the
+//! worlds.
 
 use emberwatch_protocol::control::{
     Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldStatus, parse,
@@ -39,7 +40,7 @@ pub enum Next {
 }
 
 impl ReplayState {
-    /// Creates the state of a replay before the server's first sample.
+    /// Creates the state of a replay before the first sample of the server.
     pub fn new(info: ServerInfo, has_truth: bool) -> Self {
         Self {
             info,
@@ -83,7 +84,7 @@ impl ReplayState {
         }
     }
 
-    /// Counts a step request and returns the status that refuses it.
+    /// Counts a step request, and returns the status with which it is refused.
     pub fn refuse_step(&mut self, version: u32) -> Status {
         self.n_refused += 1;
         if version == VERSION {

@@ -1,8 +1,8 @@
 //! The automatic snapshots of a server, and the snapshot that it starts with.
 //!
-//! Of the automatic snapshots, these survive a loss of power: the first, then each one that is due at least five
-//! seconds after the previous such snapshot, and the server's last one. The newest of them is kept in addition to the
-//! last few. All snapshots survive the death of any process.
+//! All automatic snapshots survive the death of any process. Some also survive a loss of power: the first one, each one
+//! that is due at least five seconds after the previous such snapshot, and the server's last one. The newest of these
+//! is kept in addition to the last few snapshots.
 
 use super::files::Files;
 use emberwatch_protocol::throttle::Throttle;
@@ -38,7 +38,7 @@ impl Autosave {
     /// Prepares the snapshots that the settings ask for, or returns `None` if they ask for none.
     ///
     /// # Errors
-    /// If the folder is not writable, or holds snapshots of an earlier run although `restore` is not set.
+    /// If the folder is not writable, or contains snapshots of an earlier run although `restore` is not set.
     pub fn new(checked: &Checked) -> Result<Option<Self>, FileError> {
         let config = &checked.config;
         if config.snapshot_every == 0 {
@@ -63,7 +63,7 @@ impl Autosave {
     }
 
     /// Returns whether a snapshot is due after `n_steps` world steps. On a slow disk, snapshots are skipped: the next
-    /// is due only when the previous one is written.
+    /// one is due only after the previous one was written.
     pub fn is_due(&self, n_steps: u64) -> bool {
         n_steps >= self.due && self.writing.is_none()
     }
@@ -111,7 +111,8 @@ impl Autosave {
     }
 }
 
-/// Returns what the next snapshot must survive. `age`: time since the latest that survives a loss of power.
+/// Returns what the next snapshot must survive. `age` is the time since the latest snapshot that survives a loss of
+/// power.
 fn durability(age: Option<Duration>, is_last: bool) -> Durability {
     match age {
         Some(age) if age < SYNC_INTERVAL && !is_last => Durability::Kill,
@@ -126,8 +127,8 @@ pub struct FirstWorlds {
     pub worlds: Vec<SnapshotWorld<Box<Episode>>>,
 }
 
-/// Loads the worlds that a server starts with. Skips damaged files of a folder. Returns `None` if new worlds should
-/// start.
+/// Loads the worlds that a server starts with. Skips damaged files in a folder. Returns `None` if the server should
+/// create new worlds.
 ///
 /// # Errors
 /// If all files are damaged, or the latest intact one does not fit.

@@ -1,5 +1,5 @@
-//! The limit on file descriptors. iceoryx2 opens some for each client and observer. Without them, a new client gets no
-//! answer at all, so a server starts only if there are enough for all.
+//! The limit on file descriptors. iceoryx2 opens several for each client and observer. If none are left, a new client
+//! gets no answer at all. So a server starts only if the limit is high enough for all clients and observers.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use thiserror::Error;
@@ -8,7 +8,7 @@ use thiserror::Error;
 /// of 16 clients and up to 8 more if its requests grow, 1 for each of 16 observers and 4 readers of hidden states.
 const NEEDED: u64 = 512;
 
-/// The error that the limit is too low for all clients and observers.
+/// The error for a limit that is too low for all clients and observers.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error(
     "file descriptors: expected a limit of at least {NEEDED}, got {got}; raise it (`ulimit -Hn`; docker: --ulimit \

@@ -52,7 +52,8 @@ impl Files {
         self.n_jobs
     }
 
-    /// Returns whether another job can be queued. Jobs whose clients have stopped waiting count until done.
+    /// Returns whether another job can be queued. A job counts until it is done, even if its client has stopped
+    /// waiting.
     pub fn has_capacity(&self) -> bool {
         self.n_jobs - self.n_done < MAX_JOBS
     }
@@ -67,7 +68,7 @@ impl Files {
     /// Waits until all jobs are done and returns their results.
     ///
     /// # Errors
-    /// If the jobs take longer than `limit`. The error holds the results so far.
+    /// If the jobs take longer than `limit`. The error contains the results so far.
     pub fn finish(mut self, limit: Duration) -> Result<Vec<FileResult>, Vec<FileResult>> {
         self.jobs = None;
         let deadline = Instant::now() + limit;

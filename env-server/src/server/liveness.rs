@@ -12,7 +12,7 @@ use std::os::fd::BorrowedFd;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Maximum number of known nodes; then the table is emptied. Bounds the memory that a reconnecting client can use.
+/// Maximum number of known nodes. A full table is emptied. This bounds the memory that a reconnecting client can use.
 const MAX_KNOWN_NODES: usize = 1024;
 
 /// The watched processes of clients and observers. When one has died, a thread removes its files, which takes
@@ -27,7 +27,7 @@ pub struct Clients {
 }
 
 impl Clients {
-    /// Returns the process of a node, and watches it from now on.
+    /// Returns the process of a node, and starts to watch the process.
     pub fn identify(&mut self, node: u128) -> ClientId {
         if let Some(&pid) = self.nodes.get(&node) {
             return ClientId { node, pid };
@@ -48,8 +48,8 @@ impl Clients {
         self.processes.values().map(WatchedProcess::descriptor)
     }
 
-    /// Returns the processes that have ended since the last call, among those of `nodes` and of clients. Stops watching
-    /// them and removes their files.
+    /// Returns the processes of `nodes` and of clients that have ended since the last call. Stops watching them and
+    /// removes their files.
     pub fn take_dead(&mut self, nodes: &HashSet<u128>) -> Vec<u32> {
         for &node in nodes {
             self.identify(node);
@@ -78,7 +78,7 @@ impl Clients {
         }
     }
 
-    /// Watches a process. Returns false if that failed and should be tried again.
+    /// Watches a process. Returns false if this failed and the caller should try again.
     fn watch(&mut self, pid: u32) -> bool {
         if self.processes.contains_key(&pid) {
             return true;
@@ -119,7 +119,7 @@ mod tests {
     use std::process::Command;
 
     #[test]
-    fn a_death_makes_the_descriptors_readable_and_is_reported_once() {
+    fn a_death_wakes_the_descriptors_and_is_reported_once() {
         let mut clients = Clients::default();
         let mut child = Command::new("sleep").arg("600").spawn().expect("a process");
         let nodes = HashSet::from([1, 2].map(|node| u128::from(child.id()) << 64 | node));

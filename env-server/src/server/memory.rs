@@ -1,6 +1,6 @@
 //! Shared memory for a server's messages. A server starts only if there is enough for all clients and observers. The
-//! memory is allocated when they connect: few clients use little, and the server never writes to memory that the
-//! system cannot supply.
+//! memory is allocated when they connect. So a few clients use little memory, and the server never writes to memory
+//! that the system cannot supply.
 
 use super::port_config::PortConfig;
 use anyhow::{Result, anyhow};
@@ -17,7 +17,8 @@ const MESSAGE_OVERHEAD: usize = 512;
 /// Shared memory of fixed size, in bytes: control messages, events and tables.
 const FIXED_BYTES: u64 = 8 << 20;
 
-/// Answers that iceoryx2 reserves per client: for each of 2 requests one buffered, one borrowed, one loaned.
+/// Number of answers that iceoryx2 reserves per client: for each of 2 requests, one buffered, one borrowed and one
+/// loaned.
 const ANSWERS: usize = 2 * 3;
 
 /// The shared memory for the messages of a server's ports.
@@ -37,7 +38,7 @@ pub struct PortIds {
 }
 
 impl PortMemory {
-    /// Creates the memory of these ports and makes it ready for a first client.
+    /// Creates the memory of these ports and prepares it for a first client.
     pub fn new(ids: &PortIds, config: &PortConfig) -> Result<Self, ChannelError> {
         let n_answers = MAX_CLIENTS * ANSWERS;
         let truth = ids.truth.map(|id| {
@@ -55,18 +56,18 @@ impl PortMemory {
         Ok(memory)
     }
 
-    /// Makes memory ready for answers to `n_clients` clients.
+    /// Allocates the memory for answers to `n_clients` clients.
     pub fn for_clients(&self, n_clients: usize) -> Result<(), ChannelError> {
         self.control.make_ready(n_clients * ANSWERS)?;
         self.step.make_ready(n_clients * ANSWERS)
     }
 
-    /// Makes memory ready for frames to `n_observers` observers.
+    /// Allocates the memory for frames to `n_observers` observers.
     pub fn for_observers(&self, n_observers: usize) -> Result<(), ChannelError> {
         self.frames.make_ready(samples(n_observers, FRAME_BUFFER))
     }
 
-    /// Makes memory ready for hidden states to `n_readers` readers.
+    /// Allocates the memory for hidden states to `n_readers` readers.
     pub fn for_readers(&self, n_readers: usize) -> Result<(), ChannelError> {
         let n_truths = samples(n_readers, TRUTH_BUFFER);
         self.truth
@@ -75,8 +76,8 @@ impl PortMemory {
     }
 }
 
-/// Returns the maximum number of samples in use: for each subscriber a full buffer and one that it reads, and for the
-/// publisher the last sample and the next.
+/// Returns the maximum number of samples in use. Each subscriber uses a full buffer and the sample that it is reading.
+/// The publisher uses the last sample and the next one.
 fn samples(n_subscribers: usize, buffer: usize) -> usize {
     n_subscribers * (buffer + 1) + 2
 }

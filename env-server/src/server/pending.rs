@@ -1,4 +1,4 @@
-//! Requests that are answered later, because they wait for resets or files.
+//! Requests that must wait for resets or files before they are answered.
 
 use super::state::Server;
 use emberwatch_protocol::control::Reply;
@@ -50,7 +50,7 @@ impl Server {
         self.answer_pending(now);
     }
 
-    /// Warns, once, if no cell of a new world is in the state with the highest reward.
+    /// Warns once if no cell of a new world is in the state with the highest reward.
     fn warn_of_barren(&mut self, world: usize, episode: &Episode) {
         let is_recorded = self.simulator.is_recorded();
         if self.has_warned_of_barren || is_recorded || episode.outcome().n_target_cells > 0 {
@@ -84,7 +84,8 @@ impl Server {
         }
     }
 
-    /// Drops requests whose clients have stopped waiting. Until then, iceoryx2 delivers no new requests of theirs.
+    /// Drops requests whose clients have stopped waiting. Before this, iceoryx2 delivers no new requests from such a
+    /// client.
     pub(super) fn cancel_abandoned(&mut self, now: Instant) {
         let simulator = &mut self.simulator;
         self.waiting_steps.retain(|(ticket, request)| {

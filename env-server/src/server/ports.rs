@@ -59,7 +59,7 @@ pub struct Ports {
     truth_service: Option<TruthService>,
     entries: Entries,
     _node: Node<Ipc>,
-    /// Dropped last, so that all other files are removed during this turn.
+    /// Dropped last, so that all other fields are dropped, and their files removed, during this turn.
     end: Option<Turn>,
 }
 
@@ -149,8 +149,8 @@ impl Ports {
         self.entries.check_at(Instant::now())
     }
 
-    /// Closes the ports and removes their files. If the files were already removed, leaves the current files of the
-    /// same names alone, because they belong to another server.
+    /// Closes the ports and removes their files. If the files were removed before, files with the same names belong to
+    /// another server, so they are left alone.
     pub fn close(self) {
         if self.entries.check().is_err() {
             std::mem::forget(self);
@@ -167,7 +167,8 @@ impl Ports {
         received(self.control.receive(), &self.failed_connections)
     }
 
-    /// Returns the reply. Replaces a reply to `hello` by a refusal if there is no memory for answers to another client.
+    /// Returns the reply. Replaces a reply to `hello` with a refusal if there is no memory for answers to another
+    /// client.
     pub fn with_memory(&self, reply: Reply) -> Reply {
         let n_clients = self.control_service.dynamic_config().number_of_clients();
         match (

@@ -8,7 +8,7 @@ use emberwatch_sim::simulator::Simulator;
 use emberwatch_sim::world::Episode;
 use std::ops::Range;
 
-/// The known observers and the numbers of published samples.
+/// The known observers, and the numbers of samples published so far.
 #[derive(Default)]
 pub struct Publications {
     observers: Vec<u128>,
@@ -20,7 +20,7 @@ pub struct Publications {
 }
 
 impl Publications {
-    /// Returns whether worlds are still to be published for new observers.
+    /// Returns whether some worlds must still be published for new observers.
     pub fn has_new_observers(&self) -> bool {
         !self.for_new.is_empty()
     }
@@ -37,7 +37,7 @@ impl Publications {
         if has_new {
             self.for_new = simulator.worlds();
         }
-        // In batches: more samples at once would overflow the buffers of new observers.
+        // Publishes in batches, because more samples at once would overflow the buffers of new observers.
         let part = self.for_new.start..self.for_new.end.min(self.for_new.start + FRAME_BUFFER);
         self.for_new.start = part.end;
         self.publish(ports, simulator, part);

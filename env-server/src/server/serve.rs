@@ -24,7 +24,7 @@ const IDLE_TICK: Duration = Duration::from_millis(250);
 /// How often a busy server makes these checks. This limits the delay until it notices that a client has died.
 const BUSY_TICK: Duration = Duration::from_millis(50);
 
-/// One of this many rounds looks for a control request before a step request.
+/// In one out of this many rounds, the server looks for a control request before a step request.
 const CONTROL_FIRST: u64 = 64;
 
 /// How often a server publishes the next batch of worlds for new observers.
@@ -104,7 +104,7 @@ impl Server {
     }
 
     /// Sleeps for at most `limit`, until a wake-up, a signal, the end of a process, or a finished reset or file job.
-    /// Returns whether there was one.
+    /// Returns whether any of these events ended the sleep.
     fn sleep(&self, limit: Duration) -> Result<bool> {
         let own = [
             self.ports.descriptor(),
@@ -141,7 +141,7 @@ impl Server {
         }
     }
 
-    /// Answers waiting requests whose world has moved or which have lost a robot, and publishes the worlds that moved.
+    /// Answers waiting requests whose worlds have moved or that have lost a robot. Publishes the worlds that moved.
     pub(super) fn answer_settled(&mut self, now: Instant) {
         while let Some((ticket, reply)) = self.simulator.next_answer(&mut self.payload) {
             let mut waiting = self.waiting_steps.iter();
@@ -205,7 +205,7 @@ impl Server {
         self.answer_settled(now);
     }
 
-    /// Does the work that needs no request: ended clients, finished jobs, expired leases, new observers.
+    /// Does the work that no request triggers: handles ended clients, finished jobs, expired leases and new observers.
     fn check_everything(&mut self, now: Instant) -> Result<()> {
         self.last_tick = now;
         self.cancel_abandoned(now);
@@ -240,7 +240,7 @@ impl Server {
         if n_leases > 0 {
             tracing::info!(n_leases, "a connection was closed without a release");
         }
-        // These answers show their own step, so they must be sent before the worlds change again.
+        // Each of these answers shows the step that it waited for, so it must be sent before the worlds change again.
         self.answer_settled(now);
     }
 }

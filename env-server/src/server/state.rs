@@ -173,7 +173,7 @@ fn announce(checked: &Checked) {
     }
 }
 
-/// Logs how many free cells random starts cannot reach, and which fixed starts no-fly cells enclose.
+/// Logs how many free cells cannot be reached from random starts, and which fixed starts are enclosed by no-fly cells.
 pub fn announce_reach(reach: &Reach) {
     if let Some(words) = reach.cut_off() {
         tracing::info!("{words}");
@@ -183,7 +183,8 @@ pub fn announce_reach(reach: &Reach) {
     }
 }
 
-/// Creates the worlds, restored from a snapshot if the settings name one, and the resets that start the others.
+/// Creates the worlds. Restores worlds from a snapshot if the settings name one, and returns the resets that start the
+/// remaining worlds.
 fn simulator(checked: Checked, steps: ThreadPool) -> Result<(Simulator, Vec<ResetJob>)> {
     let settings = checked.clone();
     let (mut simulator, mut resets) = Simulator::new(checked, steps, token_source())?;

@@ -15,7 +15,7 @@ const LIMIT: Duration = Duration::from_secs(10);
 /// Pause between two attempts.
 const INTERVAL: Duration = Duration::from_millis(100);
 
-/// The error that another server already runs the instance.
+/// The error for an instance that another server already runs.
 #[derive(Debug, Error)]
 #[error("instance {instance:?} is already running, as pid {pid}")]
 pub struct Taken {
@@ -27,13 +27,13 @@ impl Taken {
     fn is_left_over(&self) -> bool {
         match WatchedProcess::open(self.pid) {
             Ok(process) => process.has_ended(),
-            // Other errors do not show whether the process has ended.
+            // Any other error does not show whether the process has ended.
             Err(errno) => errno == Errno::SRCH,
         }
     }
 }
 
-/// Calls `open`, and calls it again while the instance belongs to a dead process.
+/// Calls `open`, and repeats the call while the instance belongs to a dead process.
 pub fn once_free<T>(mut open: impl FnMut() -> Result<T>) -> Result<T> {
     let start = Instant::now();
     loop {
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn resources_of_dead_processes_are_tried_again() {
+    fn opening_is_retried_while_a_dead_process_owns_the_instance() {
         let mut child = Command::new("true").spawn().expect("a process");
         child.wait().expect("its end");
         assert_eq!(tries(child.id()), 2);

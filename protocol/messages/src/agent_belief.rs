@@ -30,11 +30,11 @@ pub struct Intent {
 /// A checked sample of `agent`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AgentBelief {
-    /// The header, with world, episode, step and process.
+    /// The header, which contains the world, episode, step and process.
     pub header: AgentHeader,
     /// The posterior belief about the state at that step, shape `[S, H, W]`, each value in 0..=1.
     pub belief: Probabilities,
-    /// The intent of the path.
+    /// The policy, estimator and objective of the path.
     pub intent: Intent,
 }
 

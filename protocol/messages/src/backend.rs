@@ -5,8 +5,8 @@ use crate::errors::{ConnectionError, garbled};
 use crate::message::{StepReply, StepRequest};
 use std::time::Duration;
 
-/// The answer to a step request: its header, and its payload (results of worlds, results of robots, frames). The
-/// payload's length fits the header.
+/// The answer to a step request: the header and the payload (results of worlds, results of robots, frames). The length
+/// of the payload matches the header.
 pub type StepAnswer = (StepReply, Vec<u8>);
 
 /// A server, or worlds in this process.
@@ -29,13 +29,13 @@ pub trait Backend {
     /// Answers a control request in JSON with a reply in JSON.
     ///
     /// # Errors
-    /// Like [`Self::step`].
+    /// The same as [`Self::step`].
     fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError>;
 
     /// Answers a control request.
     ///
     /// # Errors
-    /// Like [`Self::step`].
+    /// The same as [`Self::step`].
     fn control(&mut self, request: &Request, timeout: Duration) -> Result<Reply, ConnectionError> {
         let text = serde_json::to_vec(request).expect("invariant: requests serialise");
         let answer = self.control_text(&text, timeout)?;

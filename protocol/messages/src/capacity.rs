@@ -12,5 +12,5 @@ pub const MAX_ROBOTS: usize = 64;
 /// Maximum number of robots of a server, over all its worlds.
 pub const MAX_ROBOT_NUMBERS: usize = 4096;
 
-/// Maximum number of cells in the frames of one world together.
+/// Maximum number of cells in all frames of one world together.
 pub const MAX_TEAM_CELLS: usize = 1 << 24;

@@ -17,18 +17,18 @@ use emberwatch_model::path::{Move, path_to_bytes};
 use std::ops::Range;
 use std::time::Duration;
 
-/// Maximum time of a step, in addition to the server's deadline.
+/// Maximum duration of a step, in addition to the server's deadline.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Maximum time of other requests. A reset simulates the burn-in of all its worlds, which takes minutes on a busy
-/// machine.
+/// Maximum duration of any other request. A reset simulates the burn-in of all its worlds, which takes minutes on a
+/// busy machine.
 pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(600);
 
 /// A lease on consecutive robots of a server, or of worlds in this process. Robots are numbered across all worlds:
 /// robot r of world w is `w * R + r`.
 ///
-/// Dropping the client drops its backend, and dropping a connection ends its leases. Unless a method documents others,
-/// its errors are a refusal (which changed nothing), a server that has ended, and no valid answer in time.
+/// Dropping the client drops its backend, and dropping a connection ends its leases. Unless it documents other errors,
+/// a method fails if the server refuses the request (and changes nothing), has ended, or sends no valid answer in time.
 pub struct Client<B> {
     backend: B,
     lease: Lease,
@@ -44,12 +44,12 @@ pub struct Claim {
     pub robots: Range<u32>,
     /// Whether to take the robots from other clients that hold them.
     pub takeover: bool,
-    /// Time after its last use when the lease ends, 0.1 s to one day; `None` for the server's default.
+    /// Time from the last use of the lease until it ends, 0.1 s to one day; `None` for the server's default.
     pub time_to_live: Option<Duration>,
 }
 
 impl Claim {
-    /// Claims robots that no other client holds, for the server's default time.
+    /// Claims robots that no other client holds. The lease has the server's default duration.
     pub fn new(robots: Range<u32>) -> Self {
         Self {
             robots,
@@ -60,7 +60,7 @@ impl Claim {
 }
 
 impl<B: Backend> Client<B> {
-    /// Acquires robots, which stay in their cells. Returns when the burn-in of their worlds is done.
+    /// Acquires robots without moving them. Returns when the burn-in of their worlds is done.
     ///
     /// # Errors
     /// If another client holds a robot, a `Busy` refusal names its process.
@@ -118,13 +118,13 @@ impl<B: Backend> Client<B> {
         self.robots.clone()
     }
 
-    /// Returns the worlds of these robots.
+    /// Returns the worlds to which these robots belong.
     pub fn worlds_of(&self, robots: &Range<u32>) -> Range<u32> {
         worlds_of(robots.start, robots.len() as u32, self.info().n_robots)
     }
 
     /// Flies a path of `n_moves` moves with each of these consecutive robots of the lease. A world moves when all its
-    /// held robots have a path, or at the server's deadline. Returns each robot's observation after that.
+    /// held robots have a path, or at the server's deadline. Returns each robot's observation after the move.
     ///
     /// # Errors
     /// `Late` if a world moved without these paths, `LeaseLost` if a robot is no longer held, and `WrongPathLength` or
@@ -138,11 +138,11 @@ impl<B: Backend> Client<B> {
         Ok(observations.expect("invariant: it is never over"))
     }
 
-    /// Flies like [`Self::step`], but returns `None` if `is_over` is true before the worlds have moved. It is checked
-    /// every [`STEP_TIMEOUT`] plus the server's deadline.
+    /// Flies as [`Self::step`] does, but returns `None` if `is_over` returns true before the worlds have moved.
+    /// `is_over` is called every [`STEP_TIMEOUT`] plus the server's deadline.
     ///
     /// # Errors
-    /// Like [`Self::step`].
+    /// The same as [`Self::step`].
     pub fn step_until(
         &mut self,
         robots: Range<u32>,
@@ -152,10 +152,10 @@ impl<B: Backend> Client<B> {
         self.step_unless(robots, paths, 0, is_over)
     }
 
-    /// Flies like [`Self::step`], with frames that show every cell.
+    /// Flies as [`Self::step`] does, but the frames show every cell.
     ///
     /// # Errors
-    /// Like [`Self::step`], and a refusal if the server's coverage is `path`.
+    /// The same as [`Self::step`], and a refusal if the server's coverage is `path`.
     pub fn step_full(
         &mut self,
         robots: Range<u32>,
@@ -177,7 +177,7 @@ impl<B: Backend> Client<B> {
     /// Returns the observations of robots at an earlier step k.
     ///
     /// # Errors
-    /// A `NotKept` refusal has the nearest step that the server keeps.
+    /// A `NotKept` refusal contains the nearest step that the server keeps.
     pub fn recall(
         &mut self,
         robots: Range<u32>,

@@ -44,7 +44,7 @@ pub struct UnknownCode {
 pub enum Status {
     /// Done.
     Ok = 0,
-    /// The request has another version than the server; detail: the server's version.
+    /// The request's protocol version differs from the server's; detail: the server's version.
     VersionMismatch = 1,
     /// No such operation; detail: the operation received.
     UnknownOperation = 2,
@@ -58,7 +58,7 @@ pub enum Status {
     WrongPathLength = 6,
     /// A byte is not a move; detail: its position in the payload.
     BadMove = 7,
-    /// The lease does not cover these robots, or was never given; detail: the first such robot.
+    /// The lease does not cover these robots, or was never granted; detail: the first such robot.
     NoLease = 8,
     /// The lease was taken over, expired or released; detail: pid of the client that took over the robot or holds it, 0
     /// if there is none.
@@ -67,9 +67,10 @@ pub enum Status {
     Busy = 10,
     /// A world is being reset; detail: the world.
     Resetting = 11,
-    /// A world was truncated and must be reset first; detail: the world.
+    /// The episode of a world was truncated, so the world must be reset first; detail: the world.
     EpisodeOver = 12,
-    /// A request for full frames to a server that does not provide them, or an action in a replay; detail: 0.
+    /// The request asks for full frames from a server that does not provide them, or for an action in a replay; detail:
+    /// 0.
     NotPermitted = 13,
     /// An unknown flag; detail: the flags received.
     UnknownFlags = 14,
@@ -81,8 +82,8 @@ pub enum Status {
     Late = 19,
     /// The step k of a path is ahead of its world; detail: the world's current step.
     Early = 20,
-    /// A step leaves out a robot of its client in the world, or names several worlds and another client holds a robot
-    /// in one of them; detail: the first such robot.
+    /// A step request leaves out a robot that its client holds in the world, or covers several worlds although another
+    /// client holds a robot in one of them; detail: the first such robot.
     Incomplete = 21,
     /// The server has no such robot; detail: number of robots of all worlds.
     NoSuchRobot = 22,
@@ -117,7 +118,7 @@ impl Status {
         Self::NoMemory,
     ];
 
-    /// Returns the message for a client of another version.
+    /// Returns the message for a client with another protocol version.
     pub fn version_mismatch(client: u32, server: u64) -> String {
         format!(
             "protocol version mismatch: the client speaks {client}, the server {server}; \
@@ -125,7 +126,7 @@ impl Status {
         )
     }
 
-    /// Explains the status with this detail in one sentence, with advice on what to do.
+    /// Explains the status and its detail in one sentence, with advice on what to do.
     pub fn explain(self, detail: u64) -> String {
         match self {
             Self::Ok => "ok".into(),

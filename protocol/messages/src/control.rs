@@ -1,4 +1,4 @@
-//! The messages of the `control` channel: requests and replies as JSON text, for everything that is rare.
+//! The messages of the `control` channel: requests and replies as JSON text, for everything except steps.
 
 use super::codes::{Status, VERSION};
 use emberwatch_model::frame::Coverage;
@@ -30,7 +30,7 @@ pub enum Request {
         /// Whether to take the robots from other clients that hold them.
         #[serde(default)]
         takeover: bool,
-        /// Time after its last use when the lease ends; `None` for the server's default.
+        /// Time from the last use of the lease until it ends; `None` for the server's default.
         #[serde(default)]
         ttl_millis: Option<u64>,
     },
@@ -44,8 +44,8 @@ pub enum Request {
         /// The lease.
         lease: u64,
     },
-    /// Start new episodes; the answer is sent when the burn-in is done. Like `Restore` and `Fork`, needs a lease on at
-    /// least one robot of these worlds, and on all their robots that are held.
+    /// Start new episodes; the answer is sent when the burn-in is done. As with `Restore` and `Fork`, the client needs
+    /// a lease on at least one robot of these worlds, and no other client may hold one.
     Reset {
         /// The lease.
         lease: u64,
@@ -61,7 +61,7 @@ pub enum Request {
         /// The file, an absolute path.
         path: String,
     },
-    /// Replace worlds of the lease by worlds from a snapshot file.
+    /// Replace worlds of the lease with worlds from a snapshot file.
     Restore {
         /// The lease.
         lease: u64,
@@ -75,7 +75,7 @@ pub enum Request {
         /// The file, an absolute path.
         path: String,
     },
-    /// Replace a world of the lease by a copy of another world.
+    /// Replace a world of the lease with a copy of another world.
     Fork {
         /// The lease on the replaced world.
         lease: u64,
@@ -143,7 +143,7 @@ pub enum Reply {
     },
     /// Answers `belief`.
     Belief {
-        /// Kind of the belief, and the step that it is about.
+        /// Kind of the belief, and the step to which it belongs.
         #[serde(flatten)]
         info: BeliefInfo,
         /// The offset of the part.
@@ -169,7 +169,7 @@ pub enum Reply {
 pub struct LeaseInfo {
     /// The lease's number, which each step request contains.
     pub lease: u64,
-    /// Time after its last use when the lease ends.
+    /// Time from the last use of the lease until it ends.
     pub ttl_millis: u64,
     /// Numbers of the robots that the lease still holds.
     pub robots: Vec<u32>,
@@ -223,7 +223,7 @@ pub struct WorldInfo {
     pub step: u64,
     /// Seed of the episode.
     pub seed: u64,
-    /// Number of resets of the world since the server started.
+    /// The episode: the number of resets of the world since the server started.
     pub episode: u64,
     /// `[row, col]` of each of the world's robots.
     pub robots: Vec<[u32; 2]>,
@@ -265,12 +265,12 @@ pub struct WorldStatus {
 }
 
 impl Reply {
-    /// Returns a refusal with the standard sentence of its status.
+    /// Returns a refusal with the standard message of its status.
     pub fn refusal(status: Status, detail: u64) -> Self {
         Self::error(status, detail, status.explain(detail))
     }
 
-    /// Returns a refusal with a specific sentence.
+    /// Returns a refusal with a specific message.
     pub fn error(status: Status, detail: u64, message: String) -> Self {
         Self::Error {
             status,
@@ -279,7 +279,7 @@ impl Reply {
         }
     }
 
-    /// Returns the refusal of a client that speaks another protocol version.
+    /// Returns the refusal for a client that speaks another protocol version.
     pub fn version_mismatch(client: u32) -> Self {
         let (status, detail) = (Status::VersionMismatch, u64::from(VERSION));
         Self::error(status, detail, Status::version_mismatch(client, detail))
@@ -313,7 +313,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn requests_read_as_protocol_md_shows_them() {
+    fn requests_are_parsed_as_protocol_md_shows_them() {
         let read = |text: &str| serde_json::from_str::<Request>(text).ok();
         let text = r#"{"op":"acquire","first_robot":0,"n_robots":4}"#;
         let expected = Request::Acquire {
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn coverage_is_what_the_server_says() {
+    fn coverage_follows_the_server_s_rule() {
         for (rule, asks, given) in [
             (CoverageRule::Path, false, Ok(Coverage::Path)),
             (CoverageRule::Path, true, Err(Status::NotPermitted)),

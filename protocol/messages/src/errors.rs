@@ -10,7 +10,7 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ChannelError {
-    /// An invalid name of an instance.
+    /// The name of an instance is invalid.
     #[error("instance name: expected 1 to 64 letters, digits, '-' or '_', got {0:?}")]
     InstanceName(String),
     /// The directory for the channels' files cannot be used.
@@ -23,7 +23,7 @@ pub enum ChannelError {
     },
     /// Another process held the lock of the channels' directory for too long.
     #[error(
-        "channel directory {path}: expected the lock within {limit:?}, got it held by {holder}"
+        "channel directory {path}: expected the lock within {limit:?}, but it is still held by {holder}"
     )]
     Locked {
         /// The lock file.
@@ -108,7 +108,7 @@ pub enum ChannelError {
         /// The system's error.
         problem: String,
     },
-    /// The check given to [`crate::interrupt::interrupt_when`] ended a wait.
+    /// The check set with [`crate::interrupt::interrupt_when`] ended a wait.
     #[error("interrupted")]
     Interrupted,
     /// iceoryx2 returned an error.
@@ -157,7 +157,7 @@ pub enum ConnectionError {
         /// The reason in words.
         message: String,
     },
-    /// The answer is invalid, because client and server are of different releases.
+    /// The answer is invalid, because the client and the server are different releases.
     #[error("answer to {what}: {problem}")]
     Garbled {
         /// Kind of the request.
@@ -182,7 +182,7 @@ pub fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // Names a flag of the agent, the usual caller. Other programs that connect this way may lack it.
+                // The message names a flag of the agent, the usual caller. Other callers may not have this flag.
                 Status::Busy => format!(
                     "busy: held by pid {detail}; wait for its release, or take over with the flag \
                      --takeover of `emberwatch-agent run`"
@@ -199,7 +199,8 @@ pub fn check_status(
     }
 }
 
-/// Checks that an answer has our protocol version, and answers our request: `(got, expected)` are sequence numbers.
+/// Checks that an answer has our protocol version and belongs to our request. `(got, expected)` are the sequence
+/// numbers of the answer and the request.
 pub fn check_answer(
     what: &'static str,
     version: u32,
@@ -234,5 +235,5 @@ pub fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
 
 /// Returns the error for a reply to another kind of request.
 pub fn unexpected(what: &'static str, reply: &impl Debug) -> ConnectionError {
-    garbled(what, format!("expected its reply, got {reply:?}"))
+    garbled(what, format!("expected the matching reply, got {reply:?}"))
 }

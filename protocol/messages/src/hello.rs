@@ -1,4 +1,4 @@
-//! The answer to `hello`: a server's settings, airspace and land.
+//! The answer to `hello`: a server's settings, airspace and zones.
 
 use emberwatch_model::grid::{Grid, Shape, ShapeError};
 use emberwatch_model::{Airspace, MAX_RADIUS, Pays, parse_color};
@@ -25,15 +25,15 @@ pub struct ServerInfo {
     pub n_moves: usize,
     /// Number of worlds.
     pub n_worlds: u32,
-    /// Number of robots of each world R.
+    /// Number of robots R of each world.
     pub n_robots: u32,
-    /// Number of observations O. Frames hold values below it, or 255 for unobserved cells.
+    /// Number of observations O. The values in frames are below O, or 255 for unobserved cells.
     pub n_observations: usize,
     /// Names of the observations.
     pub observations: Vec<String>,
     /// The model as TOML, if there is one and the server reveals it.
     pub model: Option<String>,
-    /// The name of the worlds' task, if they have one.
+    /// The name of the task that defines the worlds, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
     /// Identifies the worlds: 16 hexadecimal digits of a hash over every setting that affects rewards, except the seed
@@ -43,7 +43,7 @@ pub struct ServerInfo {
     /// Where robots may fly and what they see. Without it, they may fly everywhere and see the cells of their path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub airspace: Option<AirspaceInfo>,
-    /// The zone of each cell, if lands differ. It is for pictures: learners do not read it.
+    /// The zone of each cell, if there are several zones. It is for display only, and learners do not read it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zones: Option<ZonesInfo>,
     /// The recorded sequences, if the hidden states were recorded.
@@ -55,11 +55,11 @@ pub struct ServerInfo {
     pub max_steps: u64,
     /// Maximum number of clients at a time.
     pub max_clients: usize,
-    /// The rule for which cells a step observes.
+    /// The rule that decides which cells a step observes.
     pub coverage: CoverageRule,
     /// Whether the `truth` channel exists.
     pub publish_truth: bool,
-    /// Default time after its last use when a lease ends.
+    /// Default time from the last use of a lease until it ends.
     pub lease_millis: u64,
     /// Time that a world waits for the paths of its other held robots after the first path; 0 for no deadline.
     pub deadline_millis: u64,
@@ -77,7 +77,7 @@ impl ServerInfo {
     /// Returns where robots may fly and what they see.
     ///
     /// # Errors
-    /// If the map does not fit the grid, or a number is out of range. The error has the expected value.
+    /// If the map does not fit the grid, or a number is out of range. The error contains the expected value.
     pub fn airspace(&self) -> Result<Airspace, String> {
         let shape = self.shape().map_err(|error| error.to_string())?;
         let airspace = self.airspace.as_ref();
@@ -92,7 +92,7 @@ impl ServerInfo {
         airspace.map_or_else(|| Ok(Airspace::open(shape)), |info| info.airspace(shape))
     }
 
-    /// Returns the number of steps of the shortest episode, if any is truncated.
+    /// Returns the number of steps of the shortest episode, or `None` if episodes are never truncated.
     pub fn shortest_episode(&self) -> Option<u64> {
         let recorded = self.recorded_world.as_ref().map(|it| it.n_steps);
         let truncated = Some(self.max_steps).filter(|&steps| steps > 0);
@@ -111,7 +111,7 @@ pub struct RecordedWorld {
     pub n_steps: u64,
 }
 
-/// The rule for which cells a server's steps observe.
+/// The rule that decides which cells a server's steps observe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CoverageRule {
@@ -128,17 +128,17 @@ pub enum CoverageRule {
 pub struct AirspaceInfo {
     /// Number of rows and columns that robots see beyond each cell of their path, 0 to 8.
     pub radius: usize,
-    /// Number of observation matrices: one for the path, then one per ring around it. The last holds for all further
-    /// rings. Observation y of matrix m has the number `m * n_observations / n_rings + y`.
+    /// Number of observation matrices: one for the path, and one per ring around it. The last one applies to all
+    /// further rings. Observation y of matrix m has the index `m * n_observations / n_rings + y`.
     pub n_rings: usize,
     /// Whether visited or seen cells earn rewards.
     pub pays: Pays,
-    /// 1 for each cell where no robot may be, row by row.
+    /// No-fly map, row by row: 1 for each cell closed to robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<Vec<Vec<u8>>>,
 }
 
-/// The zones of a land, in which states change differently.
+/// The zones of the grid. The states of cells change differently in each zone.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ZonesInfo {
     /// The name of each zone.
@@ -153,7 +153,7 @@ impl AirspaceInfo {
     /// Returns where robots on a grid may fly and what they see.
     ///
     /// # Errors
-    /// If the map does not fit the grid, or a number is out of range. The error has the expected value.
+    /// If the map does not fit the grid, or a number is out of range. The error contains the expected value.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, String> {
         let (radius, n_rings) = (self.radius, self.n_rings);
         if radius > MAX_RADIUS || !(1..=radius + 1).contains(&n_rings) {
@@ -175,7 +175,7 @@ impl ZonesInfo {
     /// Returns the zone of each cell of a grid, shape `[H, W]`.
     ///
     /// # Errors
-    /// If the map does not fit the grid, or a zone has no name or colour. The error has the expected value.
+    /// If the map does not fit the grid, or a zone has no name or colour. The error contains the expected value.
     pub fn zone_map(&self, shape: Shape) -> Result<Grid<u8>, String> {
         let map = of_grid("zones", shape, &self.map)?;
         let n_zones = self.names.len();
@@ -193,7 +193,7 @@ impl ZonesInfo {
     }
 }
 
-/// Returns the numbers of a map, if it fits the grid.
+/// Returns the values of a map if it fits the grid.
 fn of_grid(what: &str, shape: Shape, rows: &[Vec<u8>]) -> Result<Grid<u8>, String> {
     let fits = rows.len() == shape.height() && rows.iter().all(|row| row.len() == shape.width());
     if !fits {

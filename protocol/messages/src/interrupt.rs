@@ -5,13 +5,14 @@ use std::sync::OnceLock;
 
 static CHECK: OnceLock<fn() -> bool> = OnceLock::new();
 
-/// Sets the check that ends waits of this process with [`ChannelError::Interrupted`] when it returns true. The waiting
-/// thread calls it after each sleep, every 50 ms or when a signal arrives. Only the first call has an effect.
+/// Sets the check for interrupts in this process. When `check` returns true, a wait ends with
+/// [`ChannelError::Interrupted`]. A waiting thread calls it every 50 ms and when a signal arrives. The check can be set
+/// only once; later calls have no effect.
 pub fn interrupt_when(check: fn() -> bool) {
     CHECK.get_or_init(|| check);
 }
 
-/// Checks for an interrupt, for other waits. They should also call it every 50 ms.
+/// Checks for an interrupt. Every long wait should call this every 50 ms.
 ///
 /// # Errors
 /// [`ChannelError::Interrupted`] if the wait must end.

@@ -39,7 +39,7 @@ mod tests {
     }
 
     #[test]
-    fn requests_too_long_or_deep_are_refused_in_short() {
+    fn requests_too_long_or_deep_get_a_short_refusal() {
         let op = |word: &str| format!(r#"{{"op":"{word}"}}"#);
         for text in [
             op(&"x".repeat(MAX_CONTROL_BYTES - 9)),

@@ -1,4 +1,4 @@
-//! A lease on robots, with the step k of its world that each path is for, and whether the path was flown.
+//! A lease on robots. It records the step k for which each path is sent, and finds out whether the path was flown.
 
 use crate::backend::{Backend, StepAnswer};
 use crate::control::{ServerInfo, WorldInfo};
@@ -44,10 +44,10 @@ pub struct Call<'a> {
     /// The step of each world that the paths are for; empty until they are first sent.
     steps: Vec<u64>,
     timeout: Duration,
-    /// The `n_sent` at which these paths were last sent. For an observation, the `n_sent` of the paths whose effect it
-    /// is to show.
+    /// The `n_sent` at which these paths were last sent. For an observation, the `n_sent` of the paths whose effect
+    /// should be observed.
     sent: u64,
-    /// Whether the observation may show a step of other paths of the lease instead.
+    /// Whether the observation may instead show the effect of other paths of the lease.
     shows_others: bool,
 }
 
@@ -64,7 +64,8 @@ impl<'a> Call<'a> {
         }
     }
 
-    /// Makes a call about earlier steps of the worlds.
+    /// Makes a call for a `Recall` request. `steps` contains the earlier step of each world that the server should
+    /// return.
     pub fn of_past(request: StepRequest, steps: Vec<u64>, timeout: Duration) -> Self {
         let call = Self::new(request, &[], timeout);
         Self { steps, ..call }
@@ -113,7 +114,7 @@ impl Lease {
         }
     }
 
-    /// Records the step of each world, like [`Self::note`].
+    /// Records the step of each world (see [`Self::note`]).
     pub fn note_all(&self, worlds: &[WorldInfo]) {
         for world in worlds {
             self.note(world.world, world.step);
@@ -134,11 +135,11 @@ impl Lease {
         }
     }
 
-    /// Sends a request once, and records the steps in its answer. Paths are for the last known steps of their worlds
-    /// when the call was first sent.
+    /// Sends a request once, and records the steps in its answer. When a call is first sent, its paths are assigned to
+    /// the last known steps of their worlds.
     ///
     /// # Errors
-    /// Like [`Backend::step`].
+    /// The same as [`Backend::step`].
     pub fn send(
         &self,
         backend: &mut dyn Backend,
@@ -175,11 +176,11 @@ impl Lease {
 
     /// Sends paths until their worlds have moved. After each timeout it observes the worlds, and sends the paths again
     /// if they have not moved. So it waits for a slow teammate, but not for a silent server. Returns the answer, and
-    /// the number of steps that passed unseen before its step. Returns `None` if `gives_up` is true after an
+    /// the number of earlier steps that the client did not see. Returns `None` if `gives_up` returns true after an
     /// observation.
     ///
-    /// `send` calls [`Self::send`] with the backend. With `accepts_late`, the answer shows the current worlds even if
-    /// they moved without these paths.
+    /// `send` calls [`Self::send`] with the backend. If `accepts_late` is set, the answer shows the current worlds even
+    /// if they moved without these paths.
     ///
     /// # Errors
     /// The errors of `send` and `gives_up`, and a `Late` refusal if worlds moved without the paths.
@@ -218,8 +219,8 @@ impl Lease {
         }
     }
 
-    /// Records paths that were not refused, unless their worlds are known to have moved before: the refusal may have
-    /// been lost.
+    /// Records that paths were sent and not refused. Skips worlds that are known to have moved before, because there
+    /// the refusal may have been lost.
     fn note_sent(&self, worlds: Range<u32>, paths: &Call<'_>) {
         for (world, step) in worlds.zip(&paths.steps) {
             let known = self.known(world);
@@ -240,7 +241,7 @@ impl Lease {
         Call::new(request, &[], paths.timeout)
     }
 
-    /// Checks that these paths, and no others, moved their worlds from the steps they were for to the steps observed.
+    /// Checks that these paths, and no other paths, moved their worlds to the observed steps.
     fn check_flown(
         &self,
         paths: &Call<'_>,
@@ -262,7 +263,7 @@ impl Lease {
     }
 
     fn steps_of(&self, worlds: Range<u32>) -> impl Iterator<Item = u64> {
-        // For a robot outside the lease, 0 will do: the server refuses it.
+        // For a robot outside the lease, any step is good enough, because the server refuses the request.
         let step = |known: &Known| known.step.load(Ordering::Relaxed);
         worlds.map(move |world| self.known(world).map_or(0, step))
     }

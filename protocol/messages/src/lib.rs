@@ -1,6 +1,6 @@
 //! The messages of PROTOCOL.md, as bytes and JSON, and the errors of requests.
 //!
-//! [`message`] and [`payload`] are the bytes of steps and samples. [`control`] is the JSON of rarer requests, and
+//! [`message`] and [`payload`] define the bytes of steps and samples, and [`control`] the JSON of all other requests.
 //! [`recording`] stores samples in a file. A [`client::Client`] flies the robots of a [`backend`]: a server, or worlds
 //! in the same process. This crate opens no channels. [`limits`] rejects requests for more memory or threads than the
 //! system allows, and [`interrupt`] ends waits.

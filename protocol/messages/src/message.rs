@@ -1,7 +1,7 @@
 //! The binary messages: `#[repr(C)]` headers of every channel, with byte tables in PROTOCOL.md.
 //!
-//! Headers hold only integers and floats, in the byte order of the host. Values with fewer valid values than bit
-//! patterns are checked by `TryFrom`. Parts of variable length follow the header as a `[u8]` payload.
+//! Headers contain only integers and floats, in the byte order of the host. Conversions with `TryFrom` reject invalid
+//! values, such as unknown codes. Parts of variable length follow the header as a `[u8]` payload.
 
 use bytemuck::{Pod, Zeroable};
 use emberwatch_model::grid::Cell;
@@ -17,7 +17,7 @@ pub trait Header: std::fmt::Debug + Default + Pod + Send + Sync {
     const TYPE_NAME: &'static str;
 }
 
-/// Names the headers as in PROTOCOL.md.
+/// Implements [`Header`] with the names in PROTOCOL.md.
 macro_rules! headers {
     ($($header:ident),* $(,)?) => {$(
         impl Header for $header {
@@ -98,7 +98,7 @@ pub struct StepReply {
     pub detail: u64,
 }
 
-/// The state of a world after a step or a reset, and the step's results for its robots together.
+/// The state of a world after a step or a reset, and the combined results of its robots in the step.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct WorldResult {
@@ -110,9 +110,10 @@ pub struct WorldResult {
     pub episode: u64,
     /// Sum of the rewards in `X_{k+1}` of the distinct cells that any robot visited.
     pub reward: f64,
-    /// Bit r is set if no client held robot r of the world: it stayed and saw nothing.
+    /// Bit r is set if no client held robot r of the world. Such a robot stays in its cell and sees nothing.
     pub hovered: u64,
-    /// Bit r is set if robot r was held, but its path was not received by the deadline: it stayed and saw nothing.
+    /// Bit r is set if robot r was held, but its path was not received by the deadline. Such a robot stays in its cell
+    /// and sees nothing.
     pub late: u64,
     /// Number of cells of the whole grid in the state with the highest reward (burning cells).
     pub n_target_cells: u32,
@@ -176,7 +177,7 @@ impl RobotResult {
 pub struct ControlRequest {
     /// [`VERSION`].
     pub version: u32,
-    /// 0.
+    /// Reserved; always 0.
     pub reserved: u32,
     /// Chosen by the client, and repeated in the answer.
     pub sequence: u64,
@@ -211,7 +212,7 @@ pub struct FrameHeader {
     pub sequence: u64,
     /// Number of the world's first robot.
     pub first_robot: u32,
-    /// Number of robots of the world R.
+    /// Number of robots R of the world.
     pub n_robots: u32,
     /// Grid height H.
     pub height: u32,
@@ -256,7 +257,7 @@ pub struct AgentHeader {
     pub sequence: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Step index k of the state that the belief is about.
+    /// Step index k of the state that the belief describes.
     pub step: u64,
     /// Seed of the episode.
     pub seed: u64,

@@ -40,7 +40,8 @@ pub struct RobotSample<'a> {
 }
 
 impl StepParts<'_> {
-    /// Checks that only existing robots stayed, that paths are complete, and that frames hold observations.
+    /// Checks that only existing robots are marked as having stayed, that paths are complete, and that frames contain
+    /// observations.
     ///
     /// # Errors
     /// Describes the first wrong value.
@@ -102,7 +103,7 @@ pub fn split_step_payload<'a>(
 /// Splits the payload of a sample on `frames`.
 ///
 /// # Errors
-/// If the payload does not fit the header. The error has the expected value.
+/// If the payload does not fit the header. The error contains the expected value.
 pub fn split_frame_payload<'a>(
     header: &FrameHeader,
     payload: &'a [u8],

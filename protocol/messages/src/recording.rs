@@ -1,7 +1,7 @@
-//! A recording: the samples that a server published, in a file. PROTOCOL.md section 13 has the byte tables.
+//! A recording: the samples that a server published, in a file. PROTOCOL.md section 13 contains the byte tables.
 //!
 //! A file begins with a [`FileHeader`]. Records follow, each a [`RecordHeader`] and a compressed body. The last record
-//! has the number of records. So the file itself reveals samples that the recorder missed, damaged records, and a
+//! contains the number of records. So the file itself reveals samples that the recorder missed, damaged records, and a
 //! missing end.
 
 mod format;

@@ -1,4 +1,4 @@
-//! Paths of a lease, on a backend with scripted answers.
+//! Tests of the paths of a lease, with a backend that gives scripted answers.
 
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::ServerInfo;
@@ -8,7 +8,7 @@ use emberwatch_messages::message::{Operation, Status, StepReply, StepRequest, Wo
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// A request's operation, and the step that it is for.
+/// The operation of a request, and the step for which it is sent.
 type Asked = (Operation, Option<u64>);
 
 /// An answer of the backend.
@@ -17,7 +17,7 @@ enum Say {
     Nothing,
     Late,
     Step(u64),
-    /// A step, and the bits of the robots that hovered and were late.
+    /// A step, and masks of the robots that hovered and that were late.
     Stayed(u64, u64, u64),
 }
 use Say::{Late, Nothing, Stayed, Step};
@@ -71,7 +71,7 @@ impl Backend for Script {
     }
 
     fn control_text(&mut self, _: &[u8], _: Duration) -> Result<Vec<u8>, ConnectionError> {
-        unreachable!("a lease sends steps alone")
+        unreachable!("a lease sends only step requests")
     }
 }
 
@@ -93,7 +93,7 @@ fn call(lease: &Lease, operation: Operation) -> Call<'static> {
 }
 
 /// Flies until the worlds have moved, or gives up after two observations. Returns the observed step and the number of
-/// steps that passed unseen.
+/// earlier steps that the client did not see.
 fn fly(
     lease: &Lease,
     script: &mut Script,
@@ -149,7 +149,7 @@ fn paths_that_did_not_move_the_world_are_late() {
     check(&[Nothing, Stayed(5, 0, 0b10)], true, Ok(Some((5, 0))));
 }
 
-/// Flies while another thread sends a request after the first one's `after`-th request.
+/// Flies while another thread sends a request, after the flying thread has sent `after` requests.
 fn fly_beside(other: Operation, after: usize, says: &[Say]) -> Result<(), Status> {
     let (lease, mut script) = lease(says);
     let mut others = call(&lease, other);

@@ -1,4 +1,4 @@
-//! One test program: each separate one would have to link the crate.
+//! All integration tests in one program: separate programs would each link the crate.
 
 mod lease;
 mod payload;
@@ -12,7 +12,7 @@ fn server(height: usize, width: usize, n_moves: usize, n_worlds: u32) -> ServerI
         "n_robots": 2, "n_observations": 3, "observations": ["normal", "latent", "fire"], "model": null, "burn_in": 20,
         "max_steps": 0, "max_clients": 16, "coverage": "path", "publish_truth": true, "lease_millis": 30000,
         "deadline_millis": 0, "recorded_world": null, "task": null}"#;
-    let mut info: ServerInfo = serde_json::from_str(text).expect("what a server says of itself");
+    let mut info: ServerInfo = serde_json::from_str(text).expect("a server's settings");
     (info.height, info.width) = (height, width);
     (info.n_moves, info.n_worlds) = (n_moves, n_worlds);
     info

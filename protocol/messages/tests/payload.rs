@@ -1,4 +1,4 @@
-//! Payloads of steps and frames: they are split at their exact length, and impossible values are refused.
+//! Payloads of steps and frames: only payloads of the exact length are split, and impossible values are refused.
 
 use emberwatch_messages::message::{
     FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, WorldResult,

@@ -1,4 +1,4 @@
-//! Recordings: what was written is read again, and missing or damaged parts are reported.
+//! Recordings: written records are read back unchanged, and missing or damaged parts are reported.
 
 use emberwatch_messages::message::{FrameHeader, RobotResult, TruthHeader, VERSION};
 use emberwatch_messages::recording::{
@@ -7,14 +7,14 @@ use emberwatch_messages::recording::{
 use emberwatch_messages::sample::Sample;
 use std::io::Write;
 
-/// Number of robots of a world.
+/// Number of robots in a world.
 const N_ROBOTS: usize = 2;
 
 fn server(height: usize, width: usize, n_moves: usize) -> Event {
     Event::Server(Box::new(crate::server(height, width, n_moves, 3)))
 }
 
-/// Makes a sample of robots that flew `n_moves` moves. `bytes` are their frames and paths.
+/// Makes a sample of robots that flew `n_moves` moves. `bytes` contains their frames and paths.
 fn frame(
     sequence: u64,
     (height, width): (u32, u32),
@@ -41,7 +41,7 @@ fn frame(
     Sample { header, payload }
 }
 
-/// Makes a sample of hidden states of a grid of 2 x 3 cells.
+/// Makes a sample of the hidden states of a 2 x 3 grid.
 fn truth(world: u32, payload: Vec<u8>) -> Sample<TruthHeader> {
     let header = TruthHeader {
         version: VERSION,
@@ -119,7 +119,7 @@ fn check_refused(bytes: &[u8], words: &str) {
     assert!(said.contains(words), "{said:?} does not say {words:?}");
 }
 
-/// Returns a record with this body and the right checksum.
+/// Returns a record with this body and a valid checksum.
 fn raw_record(kind: u32, body: &[u8]) -> Vec<u8> {
     let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::fast());
     encoder.write_all(body).expect("compress");
@@ -206,7 +206,7 @@ fn other_files_are_refused_by_what_they_begin_with() {
     let words = "cut short: expected a whole record at byte 0, got 1 bytes";
     check_refused(b"E", words);
     let (mut bytes, places) = written();
-    // A missing record is noticed at the end.
+    // A missing record is detected when the end record is read, because it contains the number of records.
     let without = [&bytes[..places[2]], &bytes[places[3]..]].concat();
     check_refused(&without, "totals: expected");
     bytes[8..12].copy_from_slice(&2u32.to_be_bytes());

@@ -14,7 +14,8 @@ fn square(side: usize) -> Shape {
     Shape::new(side, side).expect("bench shape")
 }
 
-/// Returns the default model, a model with own-state kernels and, on 64 x 64 cells, that model on a land of 35 zones.
+/// Returns the default model and a model with own-state kernels. For 64 x 64 cells, also returns the second model with
+/// 35 zones.
 fn models(side: usize) -> impl Iterator<Item = (Model, &'static str)> {
     let named = |name| Model::built_in(name).expect("bench model");
     let all = [

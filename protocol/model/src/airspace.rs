@@ -9,7 +9,7 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Airspace {
     shape: Shape,
-    /// Whether each cell is closed to robots.
+    /// For each cell, whether it is closed to robots.
     no_fly: Option<Arc<Grid<bool>>>,
     radius: usize,
     n_rings: usize,
@@ -26,18 +26,18 @@ pub struct SeenCell {
 }
 
 impl Airspace {
-    /// Makes the airspace of a whole grid, with a sensor that sees only the cells of the path.
+    /// Makes an airspace without no-fly cells, with a sensor that sees only the cells of the path.
     pub fn open(shape: Shape) -> Self {
         Self::new(shape, None, 0, 1, Pays::Visited)
     }
 
-    /// Makes the airspace of a grid without the cells of `no_fly` (shape `[H, W]`).
+    /// Makes an airspace that is closed to robots in the cells set in `no_fly` (shape `[H, W]`).
     ///
     /// The sensor sees `radius` rows and columns beyond each cell of the path, with `n_rings` observation matrices.
     /// With a radius of 0, a robot sees exactly the cells that it visits.
     ///
     /// # Panics
-    /// If the map has another shape than the grid.
+    /// If the shape of `no_fly` is not the grid's.
     pub fn new(
         shape: Shape,
         no_fly: Option<Arc<Grid<bool>>>,
@@ -46,7 +46,7 @@ impl Airspace {
         pays: Pays,
     ) -> Self {
         let dim = no_fly.as_ref().map_or(shape.dim(), |map| map.dim());
-        assert_eq!(dim, shape.dim(), "no_fly: expected the grid");
+        assert_eq!(dim, shape.dim(), "no_fly: expected the shape of the grid");
         Self {
             shape,
             no_fly: no_fly.filter(|map| map.iter().any(|closed| *closed)),
@@ -81,12 +81,12 @@ impl Airspace {
         self.no_fly.is_none()
     }
 
-    /// Returns whether each cell is closed to robots, shape `[H, W]`, if any cell is.
+    /// Returns whether each cell is closed to robots, shape `[H, W]`. `None` if all cells are open.
     pub fn no_fly(&self) -> Option<&Arc<Grid<bool>>> {
         self.no_fly.as_ref()
     }
 
-    /// Returns whether a robot may be at a cell of the grid.
+    /// Returns whether a cell of the grid is open to robots.
     #[inline]
     pub fn is_free(&self, cell: Cell) -> bool {
         !self
@@ -111,7 +111,7 @@ impl Airspace {
         steps.find(may_be).unwrap_or(step)
     }
 
-    /// Replaces the moves of a path that lead into no-fly cells, with [`Self::around`].
+    /// Replaces each move of a path that leads into a no-fly cell with the result of [`Self::around`].
     pub fn fly_around(&self, start: Cell, path: &mut [Move]) {
         if self.is_open() {
             return;
@@ -123,16 +123,16 @@ impl Airspace {
         }
     }
 
-    /// Flies a path from `start` (paper eq. 12). Each move is `z_{t+1} = z_t + v_t`, unless that is off the grid or a
-    /// no-fly cell.
+    /// Flies a path from `start` (paper eq. 12). Each move is `z_{t+1} = z_t + v_t`, unless that cell is off the grid
+    /// or closed to robots.
     pub fn fly(&self, start: Cell, path: &[Move]) -> Flight {
         let mut visited = Vec::new();
         let end = self.fly_into(start, path, &mut visited, &mut Vec::new());
         Flight { visited, end }
     }
 
-    /// Flies a path like [`Self::fly`], without allocating. Writes the visited cells to `visited`; `seen` is a scratch
-    /// buffer with any content. Returns the robot's last cell.
+    /// Flies a path as [`Self::fly`] does, but without allocating. Writes the visited cells to `visited`. `seen` is a
+    /// scratch buffer; its content does not matter. Returns the robot's last cell.
     pub fn fly_into(
         &self,
         start: Cell,
@@ -149,8 +149,8 @@ impl Airspace {
         }
     }
 
-    /// Lists each cell in sight of the visited cells once. `visited` holds row-major indices, and `rings` is a scratch
-    /// buffer with any content.
+    /// Lists every cell that the sensor sees from the visited cells, each once. `visited` contains row-major indices.
+    /// `rings` is a scratch buffer; its content does not matter.
     pub fn see_into(&self, visited: &[usize], seen: &mut Vec<SeenCell>, rings: &mut Vec<u8>) {
         const UNSEEN: u8 = u8::MAX;
         seen.clear();
@@ -182,7 +182,7 @@ impl Airspace {
         seen.iter_mut().for_each(|it| it.ring = rings[it.cell]);
     }
 
-    /// Returns the row-major indices of the distinct cells that earn a reward on a path.
+    /// Returns the row-major indices of the distinct cells that earn a reward when a path is flown.
     pub fn paying(&self, start: Cell, path: &[Move]) -> Vec<usize> {
         let visited = self.fly(start, path).visited;
         match self.pays {
@@ -191,7 +191,7 @@ impl Airspace {
         }
     }
 
-    /// Returns the cells in sight of the visited cells, like [`Self::see_into`].
+    /// Returns the cells that the sensor sees from the visited cells (see [`Self::see_into`]).
     pub fn see(&self, visited: &[usize]) -> Vec<SeenCell> {
         let mut seen = Vec::new();
         self.see_into(visited, &mut seen, &mut Vec::new());

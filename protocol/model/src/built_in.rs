@@ -1,5 +1,5 @@
-//! The models, tasks and recorded states that ship with the programs: each file of `config/models` and `config/tasks`,
-//! and each folder of `config/landscapes`, by its name. `build.rs` lists them.
+//! The models, tasks and recorded states that ship with the programs. They are the files of `config/models` and
+//! `config/tasks` and the folders of `config/landscapes`, each under its name. `build.rs` lists them.
 
 /// Built-in models, as `(name, text of the file)`.
 pub(crate) static MODELS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/models.rs"));
@@ -15,7 +15,7 @@ pub fn state_names() -> impl Iterator<Item = &'static str> {
     STATES.iter().map(|(name, ..)| *name)
 }
 
-/// Joins names as errors and `--help` list them: `wildfire, small`.
+/// Joins names with commas, for errors and `--help`: `wildfire, small`.
 pub fn listed(names: impl Iterator<Item = &'static str>) -> String {
     names.collect::<Vec<_>>().join(", ")
 }

@@ -28,7 +28,7 @@ pub enum CellMap {
 }
 
 impl CellMap {
-    /// Returns the numbers row by row, or `None` if their file was not loaded.
+    /// Returns the values row by row, or `None` if their file was not loaded.
     pub fn rows(&self) -> Option<Vec<Vec<u8>>> {
         match self {
             Self::Rows(rows) => Some(rows.clone()),
@@ -36,10 +36,10 @@ impl CellMap {
         }
     }
 
-    /// Returns the numbers, shape `[H, W]`.
+    /// Returns the values, shape `[H, W]`.
     ///
     /// # Errors
-    /// If rows differ in length, the map exceeds the largest grid, or its file was not loaded. The error has the
+    /// If rows differ in length, the map exceeds the largest grid, or its file was not loaded. The error contains the
     /// expected and the given value.
     pub fn grid(&self) -> Result<Grid<u8>, (String, String)> {
         let rows = match self {
@@ -59,10 +59,10 @@ impl CellMap {
         Ok(grid.expect("invariant: as many numbers as cells"))
     }
 
-    /// Replaces the name of a file by the numbers in it. The file is next to the model file.
+    /// Replaces the name of a `.npy` file with the numbers that it contains. The file is next to the model file.
     ///
     /// # Errors
-    /// Returns the file, and the reason why it cannot be read.
+    /// If the file cannot be read. The error contains its path and the reason.
     pub(super) fn read_beside(&mut self, model: &Path) -> Result<(), (PathBuf, String)> {
         let Self::File(name) = &*self else {
             return Ok(());

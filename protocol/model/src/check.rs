@@ -14,13 +14,14 @@ use std::ops::RangeInclusive;
 /// vanish in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
-/// Maximum number of weights of all kernels, 512 MiB in total. 64 own-state kernels of 15 x 15 cells have 59 million.
+/// Maximum number of weights in all kernels together, 512 MiB. A model with 64 own-state kernels of 15 x 15 cells has
+/// 59 million.
 const MAX_WEIGHTS: usize = 1 << 26;
 
-/// Names that no state may have, because a policy's goal is the name of a state or one of these.
+/// Reserved names, which no state may have. A policy's goal is either the name of a state or one of these words.
 const RESERVED: [&str; 5] = ["coverage", "exploit", "exploit_only", "explore", "learned"];
 
-/// Maximum distance from 1 of the sum of a distribution in a model file.
+/// Maximum difference between 1 and the sum of a distribution in a model file.
 const SUM_TOLERANCE: f64 = 1e-6;
 
 /// The checks of [`super::Model::new`]. Each returns the checked values.
@@ -110,13 +111,13 @@ impl Checker<'_> {
                 };
                 return self.wrong(what, expected, got);
             }
-            self.size(what, got, got == 0.0)?;
+            self.magnitude(what, got, got == 0.0)?;
         }
         Ok(file.states.iter().map(value).collect())
     }
 
-    /// Checks that a number is 0 or in [`RANGE`].
-    fn size(&self, what: String, got: f64, is_zero: bool) -> Result<(), ModelError> {
+    /// Checks that a number is 0, or that its magnitude is in [`RANGE`].
+    fn magnitude(&self, what: String, got: f64, is_zero: bool) -> Result<(), ModelError> {
         if is_zero || RANGE.contains(&got.abs()) {
             return Ok(());
         }
@@ -137,7 +138,7 @@ impl Checker<'_> {
         Ok(())
     }
 
-    /// Returns the observation matrices of the path and of each ring next to each other, shape `[S, O]`.
+    /// Returns the observation matrices of the path and of each ring, joined along the observations, shape `[S, O]`.
     pub fn likelihood(&self, file: &ModelFile) -> Result<Array2<f64>, ModelError> {
         let (n_states, n_named) = (file.states.len(), file.observations.len());
         let sensor = file.sensor.clone().unwrap_or_default();
@@ -278,7 +279,7 @@ impl Checker<'_> {
         Ok(kernels)
     }
 
-    /// Checks that each kernel entry names a zone and each zone has an entry, if there are zones.
+    /// If there are zones, checks that each kernel entry names a zone and that each zone has an entry.
     fn check_zones(&self, file: &ModelFile) -> Result<(), ModelError> {
         let names: HashSet<&str> = file.zones.iter().map(|zone| zone.name.as_str()).collect();
         let mut with_kernel = HashSet::new();
@@ -341,7 +342,7 @@ impl Checker<'_> {
                 if !weight.is_finite() || weight < 0.0 {
                     return self.wrong(entry.what(), "finite weights >= 0", weight);
                 }
-                self.size(entry.what(), weight, *value == 0.0 || entry.scale == 0.0)?;
+                self.magnitude(entry.what(), weight, *value == 0.0 || entry.scale == 0.0)?;
                 weights.push((row, col, weight));
             }
         }

@@ -1,4 +1,4 @@
-//! The description of a recorded world in TOML: like a model file, but without a transition.
+//! The description of a recorded world in TOML: a model file without the transition.
 
 use super::cell_map::CellMap;
 use super::file::{KernelEntry, ModelError, ModelFile, ObservationEntry, SensorEntry, StateEntry};
@@ -13,7 +13,7 @@ pub struct Description {
     pub name: String,
     /// Duration of one step, for people.
     pub step: String,
-    /// 1 for each cell where no robot may be, as in a [`ModelFile`].
+    /// No-fly map with 1 for each cell closed to robots, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<CellMap>,
     /// The sensor, as in a [`ModelFile`].
@@ -41,10 +41,10 @@ pub struct DescribedState {
 }
 
 impl Description {
-    /// Builds a model with these states, observations and rewards, in which no cell changes its state.
+    /// Builds a model with these states, observations and rewards. In it, no cell ever changes its state.
     ///
     /// # Errors
-    /// If an entry is wrong. The error names it, the expected value and the given one.
+    /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn unchanging(&self) -> Result<Model, ModelError> {
         let share = 1.0 / self.states.len().max(1) as f64;
         let state = |state: &DescribedState| StateEntry {
@@ -104,7 +104,7 @@ mod tests {
     "##;
 
     #[test]
-    fn a_description_is_a_model_whose_cells_stay_as_they_are() {
+    fn a_description_makes_a_model_whose_cells_never_change() {
         let model = Description::model_of(TEXT).expect("valid");
         let unchanging = Array4::from_shape_vec((2, 2, 1, 1), vec![1.0, 0.0, 0.0, 1.0]);
         assert_eq!(Ok(model.kernel()), unchanging.as_ref());

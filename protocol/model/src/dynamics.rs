@@ -9,15 +9,15 @@
 //! and `Dynamics::sum_kernels` compute exactly this.
 //!
 //! # How it is fast
-//! Two faster methods with the same distribution come first. `bytes.rs` decides most cells of a row with one random
-//! byte each. `parents.rs` then draws one neighbour of each remaining cell, and the vote of this neighbour, up to eight
-//! times. Only cells that are still undecided need the full sum: hardly any in the wildfire, and all in models with too
-//! many weights for tables.
+//! Two faster methods, which draw from the same distribution, are tried first. `bytes.rs` decides most cells of a row
+//! with one random byte each. For each remaining cell, `parents.rs` then draws one neighbour and this neighbour's vote,
+//! up to eight times. Only cells that are still undecided need the full sum. The wildfire model has hardly any such
+//! cells. A model with too many weights for tables needs the full sum for every cell.
 //!
 //! # Random numbers
-//! Two words of the step's ChaCha8 stream are the keys of two SplitMix64 generators, as in the sensor. One generates
-//! the bytes, the other the numbers of the draws, band by band. (ChaCha8 throughout took 2.0 of 7.1 us on a 64 x 64
-//! grid.)
+//! Two words of the step's ChaCha8 stream are the keys of two SplitMix64 generators, as for sensor noise. One generates
+//! the bytes and the other the random numbers of the draws, band by band. (On a 64 x 64 grid, a step that used only
+//! ChaCha8 spent 2.0 of its 7.1 us on random numbers.)
 
 mod bytes;
 mod kernel;
@@ -40,8 +40,8 @@ use places::{OFF_GRID, Places, centre};
 use rand::Rng;
 use std::sync::Arc;
 
-/// Number of cells finished before the next ones are begun. The bytes, states and lists of a band stay in a 32 KiB
-/// cache. A multiple of [`LANES`].
+/// Number of cells in a band, a multiple of [`LANES`]. Each band is finished before the next one begins, so that its
+/// bytes, states and lists stay in a 32 KiB cache.
 const BAND: usize = 8192;
 
 /// The transition of a world for one model on one grid, with its buffers. Results do not depend on the buffers'
@@ -76,10 +76,10 @@ struct Tables {
 }
 
 impl Dynamics {
-    /// Makes the tables of a model for a grid.
+    /// Makes the tables for a model on a grid.
     ///
     /// # Errors
-    /// [`ModelError::ZeroWeight`] where eq. 3 could divide by zero ([`Model::check_on`]).
+    /// [`ModelError::ZeroWeight`] if eq. 3 could divide by zero in some cell ([`Model::check_on`]).
     pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
         model.check_on(shape)?;
         let places = Places::new(model, shape);
@@ -111,7 +111,7 @@ impl Dynamics {
     /// Advances the states of a world from step `n` to step `n + 1`.
     ///
     /// # Panics
-    /// If `states` has another shape, is not row-major, or holds a value that is no state.
+    /// If `states` has a different shape, is not row-major, or contains a value that is not a state.
     pub fn step(&mut self, seed: u64, n: u64, states: &mut Grid<u8>) {
         assert_eq!(states.dim(), self.shape.dim(), "states: expected [H, W]");
         let cells = states.as_slice_mut().expect("states: expected row-major");
@@ -149,7 +149,7 @@ impl Dynamics {
         self.places.store(cells);
     }
 
-    /// Decides the remaining cells by the full sum of eq. 2.
+    /// Decides the remaining cells with the full sum of eq. 2.
     fn sum_kernels(&mut self, n_undecided: usize, words: &mut Words) {
         for &home in &self.undecided[..n_undecided] {
             let home = home as usize;
@@ -166,7 +166,8 @@ impl Tables {
         let mixtures = Mixture::of_kernels(&kernels, model.n_zones(), model.sees_own_state());
         let (offsets, zones) = (places.offsets(model), places.zones(model));
         let parents = Parents::new(&mixtures, &offsets, zones.as_deref());
-        // If kernels are summed, bytes may decide no cell: the sum has the whole distribution, not what bytes leave.
+        // Without `parents`, bytes must not decide any cell: the full sum gives the whole distribution, not the
+        // residual one.
         let by_bytes = if parents.is_some() {
             &mixtures[..]
         } else {
@@ -215,7 +216,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wider_vectors_change_no_cell() {
+    fn wider_vectors_do_not_change_any_cell() {
         let shape = Shape::new(40, 70).expect("test shape");
         for name in ["wildfire", "wildfire-burnout"] {
             let model = Model::built_in(name).expect(name);

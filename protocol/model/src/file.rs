@@ -31,13 +31,13 @@ pub struct ModelFile {
     pub name: String,
     /// Number of rows and columns of the transition kernel, both odd.
     pub kernel_size: [usize; 2],
-    /// Name of the state of all cells outside the grid. Without it, they add no weight.
+    /// Name of the state of all cells outside the grid. Without it, these cells add no weight.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub edge: Option<String>,
     /// The zone of each cell, as an index in `zones`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zone_map: Option<CellMap>,
-    /// 1 for each cell where no robot may be.
+    /// No-fly map: 1 for each cell closed to robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<CellMap>,
     /// The sensor of a robot. Without it, a robot sees the cells of its path.
@@ -88,14 +88,14 @@ pub struct ObservationEntry {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SensorEntry {
-    /// Number of rows and columns that it sees around each cell of the path (a Chebyshev distance).
+    /// Number of rows and columns that the sensor sees around each cell of the path (a Chebyshev distance).
     #[serde(default)]
     pub radius: usize,
     /// The cells that earn a reward.
     #[serde(default)]
     pub pays: Pays,
-    /// The observation matrices of ring 1, 2 and so on. The last one holds for all further rings. Without any,
-    /// `observed_as` of the states holds everywhere.
+    /// The observation matrices of rings 1, 2 and so on. The last one applies to all further rings. Without rings,
+    /// `observed_as` of the states applies everywhere.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub rings: Vec<RingEntry>,
 }
@@ -108,7 +108,7 @@ pub struct RingEntry {
     pub observed_as: Vec<Vec<f64>>,
 }
 
-/// The choice of cells that earn the reward of their state. Each cell counts once.
+/// The cells that earn the reward of their state. Each cell counts once.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Pays {
@@ -133,24 +133,24 @@ pub struct ZoneEntry {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KernelEntry {
-    /// Name of the zone, in all entries of a file or in none.
+    /// Name of the zone. Either every entry of a file names a zone, or none does.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zone: Option<String>,
-    /// Name of the cell's own state at step k, in all entries of a file or in none.
+    /// Name of the cell's own state at step k. Either every entry of a file has it, or none does.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub own: Option<String>,
     /// Name of the neighbour's state at step k.
     pub from: String,
     /// Name of the cell's state at step k + 1.
     pub to: String,
-    /// Factor on every weight.
+    /// Factor by which every weight is multiplied.
     #[serde(default = "one")]
     pub scale: f64,
     /// Weights `[row offset][column offset]`. The centre is the cell itself, and rows grow downward.
     pub weights: Vec<Vec<f64>>,
 }
 
-/// The reason why a model file is rejected.
+/// The reason for rejecting a model file.
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ModelError {
@@ -225,7 +225,7 @@ pub enum ModelError {
         /// The first such cell.
         cell: Cell,
     },
-    /// The transition weights of a cell can all be so small that eq. 3 divides rounding errors.
+    /// The transition weights of a cell can all be so small that eq. 3 divides by rounding errors.
     #[error(
         "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to {share:e} of \
          the largest weight, expected at least {LEAST_SHARE:e} whatever its neighbourhood"

@@ -64,7 +64,7 @@ impl Frame {
         }
     }
 
-    /// Decodes `H * W` row-major bytes. Accepts all of them or none.
+    /// Decodes `H * W` row-major bytes. One invalid byte makes the whole frame invalid.
     ///
     /// # Errors
     /// [`FrameError`] for a wrong length or a value that is not an observation.
@@ -150,7 +150,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_frame_is_accepted_whole_or_rejected_whole() {
+    fn a_frame_is_accepted_or_rejected_as_a_whole() {
         let shape = Shape::new(2, 2).expect("test shape");
         let frame = |bytes: &[u8]| Frame::from_bytes(shape, 3, bytes);
         let good = frame(&[0, 255, 2, 255]).expect("valid");

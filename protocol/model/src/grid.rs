@@ -9,7 +9,7 @@ use thiserror::Error;
 /// One value per cell, shape `[H, W]`, row-major.
 pub type Grid<T> = Array2<T>;
 
-/// One probability per state and cell, shape `[S, H, W]`; sums to one over the first axis.
+/// One probability per state and cell, shape `[S, H, W]`. The probabilities of each cell sum to one.
 ///
 /// The states are the outer axis, so that the kernels of eq. 2 run over contiguous rows of one state.
 pub type Probabilities = Array3<f32>;
@@ -46,7 +46,7 @@ impl Shape {
     /// Checks both sides and makes a shape.
     ///
     /// # Errors
-    /// [`ShapeError`] when a side is outside `1..=MAX_SIDE`.
+    /// [`ShapeError`] if a side is outside `1..=MAX_SIDE`.
     pub fn new(height: usize, width: usize) -> Result<Self, ShapeError> {
         let side = 1..=MAX_SIDE;
         if side.contains(&height) && side.contains(&width) {
@@ -91,7 +91,7 @@ impl Shape {
         }
     }
 
-    /// Returns the cell in the middle (the lower right of the middle four on even sides).
+    /// Returns the cell in the middle (for even sides, the lower right one of the middle four).
     pub fn centre(self) -> Cell {
         Cell {
             row: self.height / 2,

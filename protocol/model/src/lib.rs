@@ -1,9 +1,9 @@
 //! The hidden Markov model of the paper: its parameters, its mathematics, and a robot's moves and observations.
 //!
 //! This crate knows nothing of messages. All other modules index a [`grid`]. [`dynamics`] draws hidden states, and
-//! [`transition`] applies the same operator to beliefs. [`path`] and [`frame`] are a robot's moves and observations. A
-//! [`task`] is a world with a name, and [`built_in`] has the models, tasks and recorded states that ship with the
-//! programs. [`text`] reads settings and model files.
+//! [`transition`] applies the same operator to beliefs. [`path`] and [`frame`] represent a robot's moves and
+//! observations. A [`task`] is a named set of worlds, and [`built_in`] contains the models, tasks and recorded states
+//! that ship with the programs. [`text`] reads settings and model files.
 
 mod airspace;
 pub mod built_in;

@@ -1,8 +1,8 @@
 //! The parameters of the hidden Markov model on a grid, for simulators and filters.
 //!
-//! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation matrix `O` of
-//! eq. 1. [`super::file`] is the file format. [`super::transition`] applies the parameters to beliefs,
-//! [`super::dynamics`] to states.
+//! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation matrix `O` of eq.
+//! 1. [`super::file`] is the file format. [`super::transition`] applies the parameters to beliefs, and
+//! [`super::dynamics`] applies them to states.
 
 use super::airspace::Airspace;
 use super::built_in::MODELS;
@@ -24,7 +24,7 @@ pub struct Model {
     reward: Array1<f64>,
     edge: Option<usize>,
     zone_map: Option<Arc<Grid<u8>>>,
-    /// Whether each cell is closed to robots.
+    /// For each cell, whether it is closed to robots.
     no_fly: Option<Arc<Grid<bool>>>,
 }
 
@@ -46,7 +46,7 @@ impl Model {
         Self::built_in_files().map(|(name, _)| name)
     }
 
-    /// Lists the built-in models: the name, and the text of the file.
+    /// Lists the built-in models, each as its name and the text of its file.
     pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
         MODELS.iter().copied()
     }
@@ -54,7 +54,7 @@ impl Model {
     /// Reads and checks a model file's text.
     ///
     /// # Errors
-    /// If an entry is wrong. The error names it, the expected value and the given one.
+    /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn from_toml(text: &str) -> Result<Self, ModelError> {
         let file = toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;
         Self::new(file)
@@ -86,7 +86,7 @@ impl Model {
     /// Checks a model file and lays out its arrays.
     ///
     /// # Errors
-    /// If an entry is wrong. The error names it, the expected value and the given one.
+    /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn new(file: ModelFile) -> Result<Self, ModelError> {
         let check = Checker { model: &file.name };
         check.counts_and_names(&file)?;
@@ -116,8 +116,8 @@ impl Model {
     /// Checks that the model's maps fit a grid, and that eq. 3 cannot divide by zero or nearly zero there.
     ///
     /// # Errors
-    /// If a map has another grid, or if the weights of a cell can sum to nearly zero. The error names the first such
-    /// cell.
+    /// If a map does not fit the grid, or if the weights of a cell can sum to nearly zero. The error names the first
+    /// such cell.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
         let maps = [
             ("zone_map", self.zone_map.as_ref().map(|map| map.dim())),
@@ -145,14 +145,15 @@ impl Model {
             let (row, col) = (kernel_height / 2, kernel_width / 2);
             least[[row, col]] = column_sums[[own, row, col]];
         }
-        // The largest of all zones, because they are computed with one scale.
+        // The largest weight of all zones, because all zones are scaled by the same factor.
         let in_zones = self.kernels.iter().skip(own).step_by(self.n_own());
         let largest = in_zones
             .flatten()
             .chain(&self.bias)
             .copied()
             .fold(f64::MIN_POSITIVE, f64::max);
-        // Cells further than a kernel from the edges have the same weights, so one row and column of them is enough.
+        // All cells further than a kernel from the edges have the same weights, so checking one such row and column is
+        // enough.
         let distinct = |side: usize, kernel: usize| {
             (0..side).filter(move |&at| at <= kernel || at + kernel >= side)
         };
@@ -199,7 +200,7 @@ impl Model {
         &self.file.name
     }
 
-    /// Returns the file of the model. It can be serialised to a model file again.
+    /// Returns the entries of the model file, which can be serialised again.
     pub fn file(&self) -> &ModelFile {
         &self.file
     }
@@ -214,10 +215,10 @@ impl Model {
         self.likelihood.ncols()
     }
 
-    /// Returns the number of the sensor's observation matrices: one for the path, then one per ring around it.
+    /// Returns the number of the sensor's observation matrices: one for the path, and one per ring around it.
     ///
-    /// The last one holds for all further rings up to the radius. Observation `y` by matrix `m` has the number
-    /// `m * O / n_rings + y`.
+    /// The last one applies to all further rings up to the radius. Observation `y` of matrix `m` has the index `m * O /
+    /// n_rings + y`.
     pub fn n_rings(&self) -> usize {
         1 + self
             .file
@@ -260,7 +261,7 @@ impl Model {
     /// Returns the cells where robots may fly, and the cells that they see from there.
     ///
     /// # Errors
-    /// If a map has another grid.
+    /// If a map does not fit the grid.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, ModelError> {
         self.check_on(shape)?;
         let sensor = self.file.sensor.clone().unwrap_or_default();
@@ -273,9 +274,9 @@ impl Model {
         ))
     }
 
-    /// Returns the kernels `w[to, from, row, col]`, each of shape `[S, S, KH, KW]`, all `>= 0` (eq. 2).
+    /// Returns the kernels `w[to, from, row, col]`, each of shape `[S, S, KH, KW]`. All weights are `>= 0` (eq. 2).
     ///
-    /// Each zone has one kernel, or one per own state of the cell. The kernels of a zone follow each other.
+    /// Each zone has one kernel, or one per own state of the cell. The kernels of a zone are stored contiguously.
     pub fn kernels(&self) -> &[Array4<f64>] {
         &self.kernels
     }
@@ -285,18 +286,18 @@ impl Model {
         &self.kernels[0]
     }
 
-    /// Returns the transition bias `b[to]`, shape `[S]`, all `>= 0` (eq. 2).
+    /// Returns the transition biases `b[to]`, shape `[S]`. All are `>= 0` (eq. 2).
     pub fn bias(&self) -> &Array1<f64> {
         &self.bias
     }
 
-    /// Returns the state of all cells outside the grid. With `None`, they add no weight.
+    /// Returns the state of all cells outside the grid. If it is `None`, these cells add no weight.
     pub fn edge(&self) -> Option<usize> {
         self.edge
     }
 
-    /// Returns `P(y | x)`, shape `[S, O]`: [`Model::n_rings`] matrices next to each other, whose rows sum to one (eq.
-    /// 1).
+    /// Returns `P(y | x)`, shape `[S, O]`: [`Model::n_rings`] matrices side by side. Each row of each matrix sums to
+    /// one (eq. 1).
     pub fn likelihood(&self) -> &Array2<f64> {
         &self.likelihood
     }
@@ -317,7 +318,8 @@ impl Model {
         states.map(|state| state.name.clone()).collect()
     }
 
-    /// Returns the state with the highest reward, the first of several: fire in the wildfire model.
+    /// Returns the state with the highest reward, or the first of several such states. In the wildfire model it is
+    /// fire.
     pub fn target_state(&self) -> usize {
         let better = |best, state| {
             if self.reward[state] > self.reward[best] {

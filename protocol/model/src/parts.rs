@@ -1,10 +1,10 @@
-//! The connected parts of an [`Airspace`]: groups of cells that robots can reach from each other by moves.
+//! The connected parts of an [`Airspace`]: groups of cells between which robots can move.
 
 use super::airspace::Airspace;
 use super::grid::Cell;
 use super::path::Move;
 
-/// Marks a cell that is in no part.
+/// Marks a cell that belongs to no part.
 const NONE: u32 = u32::MAX;
 
 /// The free cells of an airspace by connected part. A robot never leaves the part in which it starts.
@@ -13,7 +13,7 @@ pub struct Parts {
     width: usize,
     /// The part of each cell, by row-major index.
     of_cells: Vec<u32>,
-    /// Number of cells of each part.
+    /// Number of cells in each part.
     sizes: Vec<usize>,
 }
 
@@ -35,7 +35,7 @@ impl Parts {
         parts
     }
 
-    /// Adds the part of a free cell: all cells that moves lead to from it.
+    /// Adds the part of a free cell: all cells that can be reached from it.
     fn add(&mut self, airspace: &Airspace, first: Cell) {
         let (shape, part) = (airspace.shape(), self.sizes.len() as u32);
         let (mut reached, mut size) = (vec![first], 1);
@@ -58,19 +58,20 @@ impl Parts {
         self.sizes.iter().sum()
     }
 
-    /// Returns the number of cells of the largest part.
+    /// Returns the number of cells in the largest part.
     pub fn n_largest(&self) -> usize {
         self.sizes.iter().copied().max().unwrap_or(0)
     }
 
-    /// Returns the number of cells of a free cell's part, and 0 for a no-fly cell.
+    /// Returns the number of cells in the part of a free cell, or 0 for a no-fly cell.
     pub fn n_around(&self, cell: Cell) -> usize {
         let part = self.of_cells[cell.row * self.width + cell.col];
         self.sizes.get(part as usize).copied().unwrap_or(0)
     }
 
-    /// Returns the possible cells of random starts, by ascending row-major index: the largest part, or the first of
-    /// several largest. Empty if no move leads out of any cell.
+    /// Returns the row-major indices of the cells in which robots can start at random, in ascending order. These are
+    /// the cells of the largest part, or of the first of several equally large parts. Empty if no move leads out of any
+    /// cell.
     pub fn starts(&self) -> Vec<usize> {
         let n_largest = self.n_largest();
         let largest = self.sizes.iter().position(|&size| size == n_largest);

@@ -47,7 +47,7 @@ impl Move {
 
     /// Returns the cell reached from `cell`. A move off the grid leaves the robot in place.
     pub fn apply(self, cell: Cell, shape: Shape) -> Cell {
-        // The change of row and column plus one. This is a table because the processor cannot predict a branch on a
+        // The change in row and column, plus one. It is a table because the processor cannot predict a branch on a
         // random move: with a `match`, 64 random moves took 0.4 us.
         const STEPS: [[usize; 2]; 4] = [[0, 1], [2, 1], [1, 0], [1, 2]];
         let [down, right] = STEPS[self as usize];
@@ -71,7 +71,7 @@ impl TryFrom<u8> for Move {
     }
 }
 
-/// Decodes a path from its wire bytes, one byte a move.
+/// Decodes a path from its wire bytes, one byte per move.
 ///
 /// # Errors
 /// [`MoveError`] names the first byte that is not a move.
@@ -97,7 +97,7 @@ pub fn check_moves(bytes: &[u8]) -> Result<(), MoveError> {
     Ok(())
 }
 
-/// Encodes a path, one byte a move.
+/// Encodes a path, one byte per move.
 pub fn path_to_bytes(path: &[Move]) -> Vec<u8> {
     path.iter().map(|&m| m as u8).collect()
 }
@@ -110,8 +110,8 @@ pub fn fly(shape: Shape, start: Cell, path: &[Move]) -> Flight {
     Flight { visited, end }
 }
 
-/// Flies a path. `after` returns the cell that a move leads to. Writes the visited cells to the first vector; the
-/// second one is a scratch buffer. Returns the robot's last cell.
+/// Flies a path. `after` returns the cell that a move leads to. Writes the visited cells to the first vector. The
+/// second vector is a scratch buffer. Returns the robot's last cell.
 #[inline]
 pub(super) fn fly_by(
     after: impl Fn(Move, Cell) -> Cell,
@@ -127,7 +127,7 @@ pub(super) fn fly_by(
     for &step in path {
         cell = after(step, cell);
         let index = shape.index(cell);
-        // Branch-free, because the processor cannot predict whether a random path has been here before.
+        // Branch-free, because the processor cannot predict whether a random path has visited this cell before.
         let (word, bit) = (&mut seen[index / 64], index % 64);
         visited[n_visited] = index;
         n_visited += usize::from(*word >> bit & 1 == 0);

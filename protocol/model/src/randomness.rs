@@ -1,7 +1,7 @@
 //! Seeded random streams: one seed per world, and one named stream per purpose.
 //!
 //! A stream is ChaCha8 with the key `seed (8 bytes, little endian) ‖ purpose (24 bytes, padded with zeros)` and the
-//! stream index as nonce. So each stream can be generated without the streams before it. ChaCha uses only integers, so
+//! stream index as nonce. So each stream can be generated without the preceding ones. ChaCha uses only integers, so
 //! streams are the same on every platform.
 
 use rand_chacha::ChaCha8Rng;
@@ -24,7 +24,7 @@ pub enum Purpose {
     Planner,
     /// Worlds simulated to find a filter's first prior.
     Prior,
-    /// The order in which a learner replays its data; indexed by pass.
+    /// The order in which a learner goes through its data; indexed by pass.
     Learner,
     /// The seed of the next episode if a reset gives none; indexed by episode.
     Episode,
@@ -32,7 +32,7 @@ pub enum Purpose {
     Weights,
     /// The channels that dropout sets to zero; indexed by update.
     Dropout,
-    /// The hidden vector at the start of a window or run; indexed by update.
+    /// A recurrent network's hidden vector at the start of a window or run; indexed by update.
     Hidden,
     /// The samples that an update draws from a replay buffer; indexed by update.
     Replay,
@@ -72,8 +72,8 @@ pub fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
     rng
 }
 
-/// Returns output `index` of the SplitMix64 generator seeded with `key` (Steele, Lea, Flood, OOPSLA 2014). Any index
-/// costs one multiply-xorshift chain, which suits noise that is read at few cells.
+/// Returns output `index` of the SplitMix64 generator seeded with `key` (Steele, Lea, Flood, OOPSLA 2014). Every output
+/// costs one multiply-xorshift chain, whatever its index. This suits noise that is needed in only a few cells.
 pub fn split_mix(key: u64, index: u64) -> u64 {
     const GOLDEN_GAMMA: u64 = 0x9e37_79b9_7f4a_7c15;
     let z = key.wrapping_add(index.wrapping_add(1).wrapping_mul(GOLDEN_GAMMA));
@@ -99,8 +99,8 @@ mod tests {
 
     #[test]
     fn split_mix_matches_the_published_generator() {
-        // The first three outputs of SplitMix64 seeded with 1234567, as listed by its authors' and
-        // many other implementations' tests.
+        // The first three outputs of SplitMix64 seeded with 1234567, as listed in the tests of its authors and of many
+        // other implementations.
         let published = [
             6457827717110365317,
             3203168211198807973,

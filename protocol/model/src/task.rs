@@ -12,14 +12,14 @@ use thiserror::Error;
 /// Maximum number of test seeds.
 pub const MAX_SEEDS: u64 = 100_000;
 
-/// The first seed of worlds for training. Lower seeds are for tests: nothing may be trained or tuned on them.
+/// The first seed of worlds for training. Lower seeds are for tests, and nothing may be trained or tuned on them.
 pub const FIRST_TRAINING_SEED: u64 = 1000;
 
 /// The server settings that define a task's worlds, by their names in `config/server.toml`, and the seeds to test on.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Task {
-    /// The built-in name or the path of the file that the task was loaded by.
+    /// The built-in name or the file path from which the task was loaded.
     #[serde(skip)]
     pub source: String,
     /// Name of the task.
@@ -30,7 +30,7 @@ pub struct Task {
     /// Recorded states, built in or a file. Empty if a model simulates the worlds.
     #[serde(default)]
     pub states: String,
-    /// Whether seeds also choose among the symmetries of the grid.
+    /// Whether the seed also selects a symmetry of the grid.
     #[serde(default)]
     pub states_symmetries: bool,
     /// The maximum recorded step at which an episode begins; the seed draws one from 0 to this.
@@ -42,7 +42,8 @@ pub struct Task {
     /// Grid width in cells; 0 if the recorded states determine it.
     #[serde(default)]
     pub width: usize,
-    /// Number of rows and columns that robots see beyond each cell of their path; -1 for the model's sensor.
+    /// Number of rows and columns that robots see beyond each cell of their path; -1 for the radius of the model's
+    /// sensor.
     #[serde(default = "as_model_says")]
     pub sensor_radius: i64,
     /// Number of moves in a path.
@@ -60,7 +61,7 @@ pub struct Task {
     pub max_steps: u64,
     /// Seeds of the worlds to test on.
     pub test_seeds: Range<u64>,
-    /// The entry in lists of the built-in tasks.
+    /// The task's entry in lists of the built-in tasks.
     #[serde(default)]
     pub listing: Option<Listing>,
 }
@@ -101,7 +102,7 @@ pub struct TaskError {
 }
 
 impl Task {
-    /// Returns the radius of the sensor, unless it is the model's.
+    /// Returns the radius of the sensor, or `None` for the radius of the model's sensor.
     pub fn radius(&self) -> Option<usize> {
         self.sensor_radius.try_into().ok()
     }
@@ -131,7 +132,7 @@ impl Task {
         Self::built_in_files().map(|(name, _)| name)
     }
 
-    /// Lists the built-in tasks by their position in lists: the name, and the text of the file.
+    /// Lists the built-in tasks in the order of [`Listing::place`], each as its name and the text of its file.
     pub fn built_in_files() -> impl Iterator<Item = (&'static str, &'static str)> {
         let mut files = TASKS.to_vec();
         files.sort_by_cached_key(|(_, text)| {
@@ -154,7 +155,7 @@ impl Task {
                 return error.to_string();
             }
             let names = listed(Self::built_in_names());
-            format!("{error}: expected one, or {names}")
+            format!("{error}: expected a file, or one of {names}")
         })?;
         let unlisted = |text| {
             Self::from_toml(text).map(|task| Self {
@@ -198,7 +199,7 @@ impl Task {
         Ok(task)
     }
 
-    /// Checks what the server cannot, because a server replaces a missing setting by its default.
+    /// Checks what the server cannot check, because it replaces a missing setting with its default.
     fn check(&self) -> Result<(), String> {
         let needs = |setting: &str, expected: &str, got: &dyn std::fmt::Display| {
             Err(format!("{setting}: expected {expected}, got {got}"))
@@ -266,7 +267,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     #[test]
-    fn built_in_tasks_have_names_worlds_places_and_ids_of_their_own() {
+    fn built_in_tasks_differ_in_name_worlds_place_and_ids() {
         assert_eq!(Task::built_in_names().next(), Some("wildfire"));
         let (mut places, mut ids) = (Vec::new(), BTreeSet::new());
         for name in Task::built_in_names() {
@@ -300,7 +301,7 @@ small => end = 32 => end = 0 => test_seeds: expected 1 to 100000, got 0
 "#;
 
     #[test]
-    fn wrong_tasks_are_refused_by_their_setting() {
+    fn an_error_names_the_wrong_setting_of_a_task() {
         for line in WRONG.trim().lines() {
             let mut parts = line.split(" => ");
             let [name, from, to, words] = [(); 4].map(|()| parts.next().expect(line));
@@ -314,7 +315,7 @@ small => end = 32 => end = 0 => test_seeds: expected 1 to 100000, got 0
         let error = Task::named("no/such").expect_err("no task").to_string();
         assert!(error.contains("task no/such: No such file"), "{error}");
         assert!(
-            error.contains("expected one, or wildfire, small"),
+            error.contains("expected a file, or one of wildfire, small"),
             "{error}"
         );
     }

@@ -4,7 +4,8 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-/// Maximum size of a settings or model file in bytes. A model of 64 states with kernels of 15 x 15 cells has 5 MB.
+/// Maximum size of a settings or model file in bytes. A model file with 64 states and kernels of 15 x 15 cells has 5
+/// MB.
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;
 
 /// Reads the text of a settings or model file. The file may be a pipe.
@@ -47,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_is_utf_8_and_other_encodings_are_named() {
+    fn text_must_be_utf_8_and_errors_name_other_encodings() {
         let wide = |text: &str, bytes: fn(u16) -> [u8; 2]| -> Vec<u8> {
             text.encode_utf16().flat_map(bytes).collect()
         };

@@ -1,9 +1,9 @@
 //! The transition operator `Phi` on beliefs: the predictor `u_{k+1} = Phi(p_k)` of paper eqs. 2-4.
 //!
-//! `phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] * x[n, i + a - A, j + c - C]` with `(A, C)` the centre of the
-//! kernel (eq. 2: a cross-correlation, not a flipped convolution). Outside the grid `x` is 1 for the model's `edge`
-//! state and 0 otherwise. Eq. 3 divides `phi` by its sum over `m`. [`super::dynamics`] draws states from the same
-//! operator.
+//! `phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] * x[n, i + a - A, j + c - C]` where `(A, C)` is the centre of
+//! the kernel (eq. 2 is a cross-correlation, not a flipped convolution). Outside the grid `x` is 1 for the model's
+//! `edge` state and 0 otherwise. Eq. 3 divides `phi` by its sum over `m`. [`super::dynamics`] draws states from the
+//! same operator.
 //!
 //! If the kernels depend on the cell's own state `o`, `phi[m | o]` has the weights of `o`, and the cell at the centre
 //! of the kernel is in state `o`. Then `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean field: it
@@ -11,13 +11,13 @@
 //!
 //! If the model has zones, each cell has the weights of its zone.
 //!
-//! `tests/model/models.rs` computes these sums directly, and `transition.rs` there compares them for random models and
-//! grids.
+//! `tests/model/models.rs` computes these sums directly, and `tests/model/transition.rs` compares the results for
+//! random models and grids.
 //!
-//! Two optimisations leave the results unchanged. The belief is copied into planes with a margin, so that all cells are
-//! computed alike and many at once. And the beliefs at taps with equal weights are added before they are multiplied
-//! (`rows.rs`). Every lane does the same operations in the same order and none is fused, so results are bit-identical
-//! on every platform.
+//! Two optimisations leave the results unchanged. The belief is copied into planes with a margin, so that the same
+//! operations compute every cell, and many cells at once. In addition, the beliefs at taps with equal weights are added
+//! before they are multiplied (`rows.rs`). Every lane performs the same operations in the same order, and no operation
+//! is fused, so results are bit-identical on every platform.
 
 mod layout;
 mod rows;
@@ -40,12 +40,13 @@ pub struct Transition<T = f32> {
     shape: Shape,
     n_states: usize,
     layout: Layout,
-    /// Groups of taps with equal weights. Each tap is an offset from a cell's place in `planes`.
+    /// Groups of taps with equal weights. Each tap is stored as an offset from a cell's place in `planes`.
     groups: Vec<Vec<usize>>,
     kernels: Kernels<T>,
     /// The weights that differ between zones.
     slots: Arc<ZonedNumbers<T>>,
-    /// The belief, one plane per state. Margins are 0, and 1 in the plane of the model's edge state.
+    /// The belief, one plane per state. Margins are 1 in the plane of the model's edge state, and 0 in the other
+    /// planes.
     planes: Vec<T>,
     /// The sum of the beliefs at the taps of each group.
     sums: Vec<[T; LANES]>,
@@ -56,10 +57,10 @@ pub struct Transition<T = f32> {
 }
 
 impl<T: NdFloat> Transition<T> {
-    /// Lays out a model's operator for a grid.
+    /// Prepares a model's operator for a grid.
     ///
     /// # Errors
-    /// [`ModelError::ZeroWeight`] where eq. 3 could divide by zero ([`Model::check_on`]).
+    /// [`ModelError::ZeroWeight`] if eq. 3 could divide by zero in some cell ([`Model::check_on`]).
     pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
         model.check_on(shape)?;
         let bias = model.bias().to_vec();
@@ -73,7 +74,8 @@ impl<T: NdFloat> Transition<T> {
         Ok(transition)
     }
 
-    /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid.
+    /// Prepares the operator for a grid from weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd `KH` and `KW`,
+    /// and biases `b[m]`.
     ///
     /// There is one kernel, or one per own state of the cell. All weights must be finite and 0 or more. If all
     /// weights of a cell are 0, its prediction is NaN.
@@ -81,8 +83,8 @@ impl<T: NdFloat> Transition<T> {
         Self::on_land(kernels, bias, shape, (None, 1))
     }
 
-    /// Lays out weights like [`Self::of_weights`], with kernels for each zone. The map has the zone of each cell, shape
-    /// `[H, W]`.
+    /// Prepares the operator as [`Self::of_weights`] does, but with kernels for each zone. The map contains the zone of
+    /// each cell, shape `[H, W]`.
     fn on_land(
         kernels: &[Array4<f64>],
         bias: &[f64],
@@ -119,10 +121,11 @@ impl<T: NdFloat> Transition<T> {
         }
     }
 
-    /// Writes `Phi(belief)` to `out`, both `[S, H, W]`. Each cell of the belief must sum to one.
+    /// Writes `Phi(belief)` to `out`. Both have shape `[S, H, W]`. The probabilities of each cell in the belief must
+    /// sum to one.
     ///
     /// # Panics
-    /// If an array has another shape or is not row-major.
+    /// If an array has a different shape or is not row-major.
     pub fn apply(&mut self, belief: &Array3<T>, out: &mut Array3<T>) {
         let dim = (self.n_states, self.shape.height(), self.shape.width());
         assert_eq!(belief.dim(), dim, "belief: expected [S, H, W]");
@@ -156,7 +159,7 @@ impl<T: NdFloat> Transition<T> {
         }
     }
 
-    /// Computes eq. 2 for the [`LANES`] cells of a chunk, from place `at` on.
+    /// Computes eq. 2 for the [`LANES`] cells of a chunk that begins at place `at`.
     #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
     fn weigh(&mut self, at: usize, chunk: usize) {
         let slots = self.slots.of_chunk(chunk);
@@ -181,7 +184,7 @@ impl<T: NdFloat> Transition<T> {
         }
     }
 
-    /// Computes eq. 3 for the cells of a chunk, from `(row, col)` on, up to the edge of the grid.
+    /// Computes eq. 3 for the cells of a chunk that begins at `(row, col)`, up to the edge of the grid.
     #[inline(always)]
     fn store(&self, row: usize, col: usize, out: &mut [T]) {
         let mut total = [T::zero(); LANES];
@@ -217,12 +220,12 @@ impl<T: NdFloat> Transition<T> {
     }
 }
 
-/// Returns the [`LANES`] values from a place on.
+/// Returns the [`LANES`] values that begin at a place.
 #[inline(always)]
 fn lanes_from<T>(planes: &[T], at: usize) -> &[T; LANES] {
     planes[at..]
         .first_chunk()
-        .expect("invariant: the layout holds LANES cells from every tap on")
+        .expect("invariant: the layout has LANES cells from every tap on")
 }
 
 /// Returns the sum of the [`LANES`] values at several offsets.

@@ -5,8 +5,8 @@ use pulp::{Arch, Simd, WithSimd};
 /// Number of cells computed at once: four AVX2 registers of `f32`. Independent sums hide the latency of additions.
 pub const LANES: usize = 32;
 
-/// Runs `work`, compiled for AVX-512, AVX2 or plain vectors, whichever the processor has. No operation is fused, so all
-/// return the same results.
+/// Runs `work`, compiled for AVX-512, AVX2 or plain vectors, depending on what the processor supports. No operation is
+/// fused, so all variants return the same results.
 ///
 /// Only inlined code is compiled this way: write `#[inline(always)]` before the closure and the functions that it
 /// calls.

@@ -1,27 +1,27 @@
-//! Numbers that differ between the zones of a land, laid out for loops over [`LANES`] cells of a row at once.
+//! Values that differ between zones, laid out for loops over [`LANES`] cells of a row at once.
 
 use super::grid::Grid;
 use super::vectors::LANES;
 use std::collections::HashMap;
 
-/// Numbers that each cell has according to its zone, such as the weights of its kernel.
+/// Values that depend on the zone of each cell, such as the weights of its kernel.
 ///
-/// A *chunk* is [`LANES`] consecutive cells of a row. Chunks are counted row by row; the last one of a row may be
-/// shorter. Chunks with the same zones share their numbers.
+/// A *chunk* is [`LANES`] consecutive cells of a row. Chunks are numbered row by row, and the last one of a row may be
+/// shorter. Chunks with the same pattern of zones share their values.
 #[derive(Debug, Clone)]
 pub struct ZonedNumbers<T> {
     /// Number of values per cell.
     n_numbers: usize,
     /// For each chunk, the index of its pattern of zones. Empty if all chunks have the same pattern.
     patterns: Vec<u32>,
-    /// For each pattern, the lanes of each number.
+    /// For each pattern, the lanes of each value.
     lanes: Vec<[T; LANES]>,
 }
 
 impl<T: Copy> ZonedNumbers<T> {
-    /// Lays out `numbers`, each with one value per zone, for the cells of a grid.
+    /// Lays out `numbers` for the cells of a grid. Each entry of `numbers` has one value per zone.
     ///
-    /// `zones` has the zone of each cell, shape `[H, W]`. Without it, all cells are in zone 0.
+    /// `zones` contains the zone of each cell, shape `[H, W]`. Without it, all cells are in zone 0.
     pub fn new(numbers: &[Vec<T>], zones: Option<&Grid<u8>>) -> Self {
         let (mut patterns, mut distinct) = (Vec::new(), Vec::new());
         let mut indices = HashMap::new();
@@ -51,12 +51,12 @@ impl<T: Copy> ZonedNumbers<T> {
         }
     }
 
-    /// Returns the number of bytes of memory it takes, besides itself.
+    /// Returns the size of its heap memory in bytes.
     pub fn memory_bytes(&self) -> usize {
         size_of_val(&*self.patterns) + size_of_val(&*self.lanes)
     }
 
-    /// Returns the numbers of a chunk's cells.
+    /// Returns the values for the cells of a chunk.
     #[inline(always)]
     pub fn of_chunk(&self, chunk: usize) -> &[[T; LANES]] {
         let pattern = self
@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn chunks_with_the_same_zones_share_their_numbers() {
+    fn chunks_with_the_same_zones_share_their_values() {
         let numbers = [vec![1, 2, 3], vec![4, 5, 6]];
         let zones = Grid::from_shape_fn((4, LANES + 2), |(row, _)| (row % 3) as u8);
         let zoned = ZonedNumbers::new(&numbers, Some(&zones));
@@ -81,7 +81,7 @@ mod tests {
         assert_eq!(
             zoned.lanes.len(),
             2 * 5,
-            "three of whole chunks, two of short ones"
+            "three patterns of whole chunks, two of short ones"
         );
         let alike = ZonedNumbers::new(&numbers, None);
         assert_eq!(alike.of_chunk(5), [[1; LANES], [4; LANES]]);

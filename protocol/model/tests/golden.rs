@@ -18,13 +18,13 @@ fn array<T: ReadableElement, D: ndarray::Dimension>(
     file: &mut Npz,
     name: &str,
 ) -> ndarray::ArrayBase<OwnedRepr<T>, D> {
-    file.by_name(name).expect("an array of the type asked for")
+    file.by_name(name).expect("an array of the requested type")
 }
 
 #[test]
 fn the_wildfire_is_the_authors() {
     let model = Model::wildfire();
-    // The authors' kernel is f32: equal up to its rounding.
+    // The authors' kernel is f32, so the kernels are equal only up to rounding.
     let reference: Array4<f32> = array(&mut npz("a1_transition.npz"), "kernel");
     for (ours, theirs) in model.kernel().iter().zip(&reference) {
         let bound = 1.2e-7 * ours.abs();
@@ -75,8 +75,8 @@ fn check_phi<T: NdFloat + ReadableElement>(model: &Model, sizes: &[&str], end: &
 #[test]
 fn phi_matches_the_reference_on_states_and_beliefs() {
     let mut sizes = vec!["1x1", "2x2", "3x3", "5x5", "4x7", "1x6"];
-    // In double precision, use the reference's own kernel, which was converted from f32: the exact parameters differ
-    // from it by 6e-9.
+    // In double precision, the test uses the reference's kernel, which was converted from f32. The exact parameters
+    // differ from it by 6e-9.
     let mut file = Model::wildfire().file().clone();
     let kernel: Array4<f32> = array(&mut npz("a1_transition.npz"), "kernel");
     for entry in &mut file.kernel {

@@ -1,4 +1,4 @@
-//! One test program: each separate one would have to link the crate.
+//! All integration tests in one program: separate programs would each link the crate.
 
 mod golden;
 mod model;

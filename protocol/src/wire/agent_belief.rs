@@ -32,14 +32,14 @@ pub struct BeliefPublisher {
 struct Ports {
     service: AgentService,
     memory: MessageMemory,
-    /// Size of a sample that memory is allocated for, in bytes.
+    /// Size in bytes of the samples for which memory is allocated.
     n_bytes: usize,
     publisher: Publisher<Ipc, [u8], WireHeader<AgentHeader>>,
     _node: Node<Ipc>,
 }
 
 impl BeliefPublisher {
-    /// Opens the channel. `n_bytes` is the size of a sample in bytes, which may grow.
+    /// Opens the channel. `n_bytes` is the size of the first sample in bytes; later samples may be larger.
     ///
     /// # Errors
     /// If the channel cannot be opened, or has too many agents.
@@ -78,14 +78,15 @@ impl BeliefPublisher {
         })
     }
 
-    /// Returns whether there are readers. Also true if the channel's files were removed, so that readers cannot find
-    /// it.
+    /// Returns whether there are readers. Also returns true if the channel's files were removed, so that [`Self::show`]
+    /// is called and reports the error.
     pub fn is_watched(&self) -> bool {
         self.ports.check().is_err()
             || self.ports.service.dynamic_config().number_of_subscribers() > 0
     }
 
-    /// Publishes a belief of shape `[S, H, W]`. `about` needs the world, robots, episode, step and seed.
+    /// Publishes a belief of shape `[S, H, W]`. The caller fills in the world, robots, episode, step and seed of
+    /// `about`.
     ///
     /// # Errors
     /// If iceoryx2 cannot publish it, or the channel's files were removed.
@@ -130,8 +131,8 @@ impl BeliefPublisher {
     }
 }
 
-/// Returns the number of samples in use at a time: for each reader a buffer and one being read, and the last and the
-/// next.
+/// Returns the maximum number of samples in use at a time. Each reader uses its buffer and the sample that it is
+/// reading. The publisher uses the last sample and the next one.
 fn n_messages(n_readers: usize) -> usize {
     n_readers * (AGENT_BUFFER + 1) + 2
 }

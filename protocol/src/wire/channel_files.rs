@@ -2,7 +2,7 @@
 //! lives, and whether the file is finished.
 //!
 //! iceoryx2 stores nodes and services in a directory, and memory segments next to it. A port's id contains the process
-//! that created it, and the time.
+//! that created the port, and the time of creation.
 
 use super::directory::{SHARED_MEMORY, channel_directory, prefix};
 use super::ipc::Ipc;
@@ -20,8 +20,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Minimum age of leftovers of a living process. Younger files may still be in creation, by a client that takes no
-/// turns.
+/// Minimum age at which a file of a living process can count as left over. A client that takes no turns may still be
+/// creating a younger file.
 const MAKING: Duration = Duration::from_secs(1);
 
 /// The folders of channel files, and the prefix of their names.
@@ -57,7 +57,7 @@ impl ChannelFiles {
     }
 
     /// Returns whether a segment is unfinished: it is empty, or not yet readable. The memory of a living port grows
-    /// without a turn and is opened only when it is finished, so it does not count.
+    /// without a turn and is opened only when it is finished, so it does not count as unfinished.
     pub(super) fn is_unfinished(&self, segment: &Path) -> Result<bool, Error> {
         let unfinished = |found: Metadata| found.len() == 0 || found.mode() & 0o400 == 0;
         let grows =
@@ -127,12 +127,12 @@ impl ChannelFiles {
             .strip_prefix(&self.prefix)
             .and_then(|name| name.split_once('.'));
         let words = stem.map_or("", |(stem, _)| stem).split('_');
-        // Short numbers are the numbers of a port's segments.
+        // Short numbers are not ids: they number the segments of a port.
         let ids = words.filter(|word| word.len() > 10);
         ids.filter_map(|word| word.parse().ok()).collect()
     }
 
-    /// Returns the id of the node of a folder, or of a file next to it.
+    /// Returns the id of the node to which a folder, or a file next to the folder, belongs.
     pub(super) fn node(&self, path: &Path) -> Option<u128> {
         let name = name(path);
         let monitor = name.strip_prefix(&self.prefix);
@@ -174,7 +174,7 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
     Ok((living, dead))
 }
 
-/// Returns whether a node lives in another PID namespace: the process that holds its lock has another number here, or
+/// Returns whether a node lives in another PID namespace: the process that holds its lock has a different id here, or
 /// none.
 pub fn lives_elsewhere(node: u128) -> bool {
     let monitor = format!("nodes/{}{node}.node_monitor", prefix());
@@ -194,15 +194,16 @@ fn service_id(text: &str) -> Option<u128> {
     Some(half("unique_value")? << 64 | half("payload_value")?)
 }
 
-/// Returns whether the object with this id may still be in creation. An id contains the time, and the process that
-/// began it.
+/// Returns whether the object with this id may still be being created. The id contains the process that creates it, and
+/// the time at which this began.
 pub(super) fn is_in_the_making(id: u128) -> Result<bool, Error> {
     let (seconds, nanos) = (id as u32, (id >> 32) as u32);
     let age = since_boot().saturating_sub(Duration::new(seconds.into(), nanos));
     Ok(age < MAKING && lives(id)?)
 }
 
-/// Returns whether the process that created an id lives, or another process with its number.
+/// Returns whether the process that created an id is alive. Also returns true if another process has the same process
+/// id.
 pub(super) fn lives(id: u128) -> Result<bool, Error> {
     Ok(!matches!(
         process_state(node_pid(id))?,
@@ -232,8 +233,8 @@ pub(super) fn entries(folder: &Path) -> Result<Vec<PathBuf>, Error> {
     }
 }
 
-/// Returns the protocol version of a channel of an instance, if it is not ours. Reads the files directly, because
-/// iceoryx2 would open each service, and could wait for one forever.
+/// Returns the protocol version of an instance's channel, if it differs from ours. Reads the files directly, because
+/// iceoryx2 would open each service, which could block forever.
 pub(super) fn other_version(instance: &str, channel: &str) -> Option<u32> {
     let end = format!("/{instance}/{channel}\"");
     let version = |text: &str| {

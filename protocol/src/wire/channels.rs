@@ -37,13 +37,14 @@ pub const MAX_TRUTH_READERS: usize = 4;
 /// Number of frames that an observer may be behind before it loses the oldest.
 pub const FRAME_BUFFER: usize = 64;
 
-/// Number of hidden states that a reader may be behind: a batch of this many worlds is never lost.
+/// Number of hidden states that a reader may be behind before it loses the oldest. The states of this many worlds can
+/// be published at once without loss.
 pub const TRUTH_BUFFER: usize = 128;
 
 /// Maximum number of readers of `agent` at a time.
 pub const MAX_AGENT_READERS: usize = 4;
 
-/// Number of beliefs that a reader may be behind before it loses the oldest. Pictures need only the newest.
+/// Number of beliefs that a reader may be behind before it loses the oldest. A display needs only the newest.
 pub const AGENT_BUFFER: usize = 4;
 
 /// Maximum number of processes attached to an instance at a time.
@@ -79,7 +80,7 @@ pub type WakeService = event::PortFactory<Ipc>;
 pub enum Channel {
     /// Steps, request-response.
     Step,
-    /// Rarer requests, request-response.
+    /// All other requests, request-response.
     Control,
     /// Frames of the robots, publish-subscribe.
     Frames,
@@ -121,7 +122,7 @@ fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
     }
 }
 
-/// The services of an instance, which its methods open or create with their limits.
+/// The services of an instance. The methods open or create each service with its limits.
 pub struct Services<'a> {
     /// The process's node.
     pub node: &'a Node<Ipc>,
@@ -130,18 +131,19 @@ pub struct Services<'a> {
 }
 
 impl Services<'_> {
-    /// Opens the `step` service, or creates it; for the server.
+    /// Opens or creates the `step` service. Only servers call this.
     ///
     /// # Errors
-    /// If iceoryx2 cannot create it, for example because old clients hold a service with other limits.
+    /// If iceoryx2 cannot create it, for example because clients of an older release keep a service with different
+    /// limits open.
     pub fn create_step(&self) -> Result<StepService, ChannelError> {
         self.create(Channel::Step)
     }
 
-    /// Opens the `control` service, or creates it; for the server.
+    /// Opens or creates the `control` service. Only servers call this.
     ///
     /// # Errors
-    /// Like [`Self::create_step`].
+    /// The same as [`Self::create_step`].
     pub fn create_control(&self) -> Result<ControlService, ChannelError> {
         self.create(Channel::Control)
     }
@@ -171,7 +173,7 @@ impl Services<'_> {
             .map_err(ipc_error("open the frames channel"))
     }
 
-    /// Opens or creates the `truth` service, for evaluation and pictures, never for learners.
+    /// Opens or creates the `truth` service. It is for evaluation and display, and learners must never read it.
     ///
     /// # Errors
     /// If iceoryx2 can neither open nor create it.
@@ -180,7 +182,7 @@ impl Services<'_> {
             .map_err(ipc_error("open the truth channel"))
     }
 
-    /// Opens or creates the `agent` service. Both agents and readers may create it.
+    /// Opens or creates the `agent` service. An agent or a reader may create it.
     ///
     /// # Errors
     /// If iceoryx2 can neither open nor create it.

@@ -1,4 +1,4 @@
-//! Removes the files of dead processes, which may have died at any instruction, even while they started or ended.
+//! Removes the files of dead processes. A process may have died at any instruction, even while it started or ended.
 //!
 //! During a [`Turn`] no other process creates or removes anything. So every file either belongs to a node whose process
 //! lives, or to a service that such a node uses, or it is left over. iceoryx2 itself removes dead nodes from services
@@ -6,21 +6,22 @@
 //!
 //! Names of files:
 //!
-//! - A node's folder `nodes/<id>/` has a finished `.port_tag` and `.service_tag` for each of its ports and services
-//!   before these exist.
-//! - Segments are `<prefix><hash>_<id>[_<id>].<kind>`, sockets `<prefix><id>.event`. A hash has letters or at least 40
-//!   digits; an id has at most 39 decimal digits. The low three 32-bit words of an id are seconds and nanoseconds of
-//!   `CLOCK_MONOTONIC` when it was created, and the process that created it.
+//! - For each port and service of a node, a finished `.port_tag` or `.service_tag` is in the node's folder
+//!   `nodes/<id>/` before the port or service exists.
+//! - Segments are `<prefix><hash>_<id>[_<id>].<kind>`, sockets `<prefix><id>.event`. A hash contains letters or at
+//!   least 40 digits; an id has at most 39 decimal digits. The low three 32-bit words of an id are the time of its
+//!   creation (seconds and nanoseconds of `CLOCK_MONOTONIC`) and the process that created it.
 //! - A finished tag cannot be written to. A finished segment can be read and is not empty, but the `.data` of a living
 //!   port grows without a turn.
 //!
-//! The order is: list files before nodes and tags, and leave what appeared later, as well as ids that a living process
-//! created less than a second ago. Remove unfinished segments, except `.data` of living processes and of living nodes'
-//! ports. Once their unfinished tags are gone, let iceoryx2 remove dead nodes that have their details and share a
-//! service with a living node. Remove folders and `.node_monitor*` files of other dead nodes, `services/*.service`
-//! without the tag of a living node, and segments and sockets whose ids belong to no living port or remaining service
-//! (`unique_service_id` in its file). A node in an undefined state lives as long as the process in its id. A file that
-//! cannot be listed or read may belong to a living process, so an error ends the cleanup.
+//! The cleanup lists files before nodes and tags. It keeps files that appeared later, and files whose id a living
+//! process created less than a second ago. First it removes unfinished segments, except `.data` of living processes and
+//! of living nodes' ports. Then it removes the unfinished tags of dead nodes, and lets iceoryx2 remove those dead nodes
+//! that have their details and share a service with a living node. Finally it removes the folders and `.node_monitor*`
+//! files of all other dead nodes, `services/*.service` files for which no living node has a tag, and segments and
+//! sockets whose ids belong to no living port and no remaining service (`unique_service_id` in its file). A node in an
+//! undefined state counts as alive while the process in its id is alive. A file that cannot be listed or read may
+//! belong to a living process, so an error ends the cleanup.
 
 use super::channel_files::{
     ChannelFiles, Used, any, entries, is_in_the_making, is_writable, metadata, nodes,
@@ -38,7 +39,7 @@ use std::io::Error;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Maximum wait until a segment is finished, or counts as left over.
+/// Maximum wait until a segment is finished or removed.
 const UNFINISHED: Duration = Duration::from_millis(1500);
 
 /// Interval between two checks of an unfinished segment.
@@ -47,7 +48,8 @@ const INTERVAL: Duration = Duration::from_millis(10);
 /// Removes the files of dead processes, and returns the number of removed files and folders.
 ///
 /// # Errors
-/// If another process keeps the turn for too long, or a file cannot be read. Its process may live, so the rest is kept.
+/// If another process keeps the turn for too long, or a file cannot be read. The process of such a file may be alive,
+/// so the remaining files are kept.
 pub fn remove_leftovers() -> Result<usize, ChannelError> {
     let turn = Turn::take_to_end()?;
     if !turn.is_alone() {
@@ -57,8 +59,8 @@ pub fn remove_leftovers() -> Result<usize, ChannelError> {
     removed.map_err(|error| not_usable(&channel_directory(), error))
 }
 
-/// Removes the files of dead processes, and waits for segments that processes without turns are creating: iceoryx2
-/// waits forever for an unfinished segment.
+/// Removes the files of dead processes, and waits until processes without turns have finished the segments that they
+/// are creating. Otherwise iceoryx2 could wait forever for an unfinished segment.
 pub(crate) fn make_way() -> Result<(), ChannelError> {
     await_finished(&ChannelFiles::of_user(), || {
         if let Err(error) = remove_leftovers() {
@@ -90,8 +92,8 @@ impl ChannelFiles {
     /// Removes the files of dead processes. Stops at the first error, because an unreadable file may belong to a living
     /// process.
     fn remove_leftovers(&self, config: &Config) -> Result<usize, Error> {
-        // Files are listed before nodes and tags, so that the list has no files that a client without turns creates
-        // meanwhile.
+        // Files are listed before nodes and tags, so that the list does not include files that a client without turns
+        // creates meanwhile.
         let list = |folder: &str| entries(&self.root.join(folder));
         let (node_files, services) = (list("nodes")?, list("services")?);
         let mut ports = self.segments()?;
@@ -124,7 +126,7 @@ impl ChannelFiles {
     fn remove_unfinished(&self, used: &Used) -> Result<usize, Error> {
         remove_if(self.segments()?, |path| {
             let ids = self.ids(path);
-            // Living ports in another PID namespace may be creating it, and their processes cannot be checked.
+            // A living port in another PID namespace may be creating the segment, and its process cannot be checked.
             let is_of_living = !ids.is_empty() && ids.iter().all(|id| used.ids.contains(id));
             Ok(self.is_unfinished(path)? && !is_of_living && !any(&ids, is_in_the_making)?)
         })
@@ -224,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unfinished_segment_is_waited_for_but_not_without_end() {
+    fn the_wait_for_an_unfinished_segment_is_limited() {
         // The temporary folder is used so that leftovers do no harm if this process is killed.
         let files = ChannelFiles {
             shared: std::env::temp_dir(),
@@ -247,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn remains_of_a_dead_process_go_while_its_peer_lives() {
+    fn files_of_a_dead_process_are_removed_while_its_peer_lives() {
         let files = ChannelFiles {
             shared: std::env::temp_dir(),
             ..files_of_test("half-dead")
@@ -271,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_living_process_uses_is_removed_and_nothing_else() {
+    fn exactly_the_files_of_no_living_process_are_removed() {
         let me = std::process::id();
         let files = files_of_test("leftovers");
         let (root, prefix) = (&files.root, &files.prefix);
@@ -298,8 +300,8 @@ mod tests {
         assert!(is_young, "ids are of our clock: {port}");
         let hash = "0123456789abcdef".repeat(3)[..40].to_owned();
         let segment = |name: String| files.shared.join(format!("{prefix}{hash}_{name}"));
-        // Three files that must stay: of a port that grows, of a port that a client without turns creates, and of a
-        // connection to a living port.
+        // Three files that must stay: the memory of a growing port, the memory of a port that a client without turns is
+        // creating, and a connection to a living port.
         make(segment(format!("{port}__2.data")), 0o200);
         make(segment(format!("{new}.dynamic")), 0o200);
         create_dir(root.join(format!("nodes/{new}"))).expect("a folder");

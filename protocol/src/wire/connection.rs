@@ -31,8 +31,8 @@ type StepClient = RequestClient<StepRequest, StepReply>;
 
 struct Ports {
     step: Option<StepClient>,
-    /// The service owns one of the entries. If it were closed before the ports, the entries would look like another
-    /// program's.
+    /// Kept open because the service owns one of the entries. If it were closed before the ports, the entries would
+    /// seem to belong to another program.
     step_service: StepService,
     texts: TextPort,
 }
@@ -41,7 +41,7 @@ impl Connection {
     /// Connects to the server of an instance and shakes hands. `client` names this program in the server's log.
     ///
     /// # Errors
-    /// If no server runs on the instance, or it speaks another version, or it does not answer in time.
+    /// If no server runs on the instance, or if the server speaks another version or does not answer in time.
     pub fn open(
         instance: &Instance,
         client: &str,
@@ -71,7 +71,7 @@ impl Connection {
 
     /// Opens all ports except the port for steps, whose size depends on the server's settings.
     fn open_ports(instance: &Instance, limit: Duration) -> Result<Opened<Ports>, ConnectionError> {
-        let _turn = Turn::take_within(limit)?; // Declared first, so that after an error the ports are dropped during it.
+        let _turn = Turn::take_within(limit)?; // Declared first, so that on an error it is dropped after the ports.
         check_descriptors("connect", CLIENT_DESCRIPTORS)?;
         let node = create_node()?;
         let services = Services {
@@ -114,7 +114,7 @@ impl Connection {
         self.ports.texts.exchange.server_process.descriptor()
     }
 
-    /// Checks that the server's process runs, without a request.
+    /// Checks that the server's process runs, without sending a request.
     ///
     /// # Errors
     /// If the server has ended.

@@ -19,8 +19,8 @@ const CHECK_INTERVAL: Duration = Duration::from_millis(200);
 
 /// Returns the directory of this user's channel files: `/dev/shm/emberwatch-<uid>/`.
 ///
-/// It is next to the shared memory, so that both exist or neither does. It is the same for every process of the user,
-/// in any session.
+/// It is next to the shared memory, so that either both exist or neither does. It is the same for every process of the
+/// user, in any session.
 pub fn channel_directory() -> PathBuf {
     PathBuf::from(format!(
         "{SHARED_MEMORY}/emberwatch-{}/",
@@ -28,8 +28,8 @@ pub fn channel_directory() -> PathBuf {
     ))
 }
 
-/// The files by which other processes find a node, its services and ports. Without one of them, the node cannot be
-/// found.
+/// The files by which other processes find a node, its services and its ports. If any of these files is missing, the
+/// node cannot be found.
 #[derive(Debug)]
 pub struct Entries {
     paths: Vec<PathBuf>,
@@ -37,7 +37,7 @@ pub struct Entries {
 }
 
 impl Entries {
-    /// Lists the files of a node. Call it when the node's ports are made.
+    /// Lists the files of a node. Call it after the node's ports have been created.
     ///
     /// # Errors
     /// If the files cannot be listed.
@@ -62,7 +62,7 @@ impl Entries {
         })
     }
 
-    /// Checks like [`Self::check`], but does nothing if the last check was shortly before `now`.
+    /// Checks as [`Self::check`] does, but does nothing if the last check was shortly before `now`.
     ///
     /// # Errors
     /// If a file was removed.
@@ -124,7 +124,7 @@ pub(crate) fn prefix() -> String {
     format!("emberwatch-{}_", rustix::process::getuid().as_raw())
 }
 
-/// Returns the error for a file or folder that the system does not allow using.
+/// Returns the error for a file or folder that the system does not allow this process to use.
 pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> ChannelError {
     if error.raw_os_error() == Some(Errno::MFILE.raw_os_error()) {
         return no_descriptors("use the channel directory", CLIENT_DESCRIPTORS);
@@ -182,12 +182,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_directory_that_others_may_write_to_is_refused() {
+    fn a_directory_writable_by_others_is_refused() {
         let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
         own_directory(&path).expect("a new directory");
         own_directory(&path).expect("the same again");
         std::fs::set_permissions(&path, Permissions::from_mode(0o600)).expect("chmod");
-        own_directory(&path).expect("what a umask took is given back");
+        own_directory(&path).expect("permissions removed by a umask are restored");
         assert_eq!(path.metadata().expect("there").mode() & 0o777, 0o700);
         std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("chmod");
         assert!(own_directory(&path).is_err());

@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 /// Maximum time between two checks for the answer, which limits the cost of a lost wake-up.
 const LONGEST_SLEEP: Duration = Duration::from_millis(50);
 
-/// Maximum time in which the answering side must release a request that was given up.
+/// Maximum time for the answering side to release an abandoned request.
 const RELEASE_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A port that sends requests.

@@ -17,7 +17,7 @@ pub struct FailedConnections {
 }
 
 impl FailedConnections {
-    /// Returns a handler for a port that counts its failed connections.
+    /// Returns a handler that counts the failed connections of a port.
     pub fn counter(&self) -> impl DegradationFn + 'static {
         let count = self.count.clone();
         move |_: DegradationCause, _: &DegradationInfo| {
@@ -30,8 +30,8 @@ impl FailedConnections {
         self.count.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Warns, at most every ten seconds, if connections failed since the last call and file descriptors are the reason.
-    /// The death of a client is another reason.
+    /// Warns, at most every ten seconds, if connections failed since the last call because file descriptors ran out. A
+    /// connection can also fail because its client died; then there is no warning.
     pub fn warn(&self, now: Instant) {
         if self.count.swap(0, Ordering::Relaxed) == 0 {
             return;

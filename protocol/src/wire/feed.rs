@@ -7,11 +7,11 @@ use emberwatch_model::grid::Probabilities;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Time between two published beliefs of a world. No screen is faster, and each costs a copy.
+/// Time between two published beliefs of a world. No screen is faster, and each published belief costs a copy.
 const INTERVAL: Duration = Duration::from_millis(20);
 
-/// Maximum time at the end for readers to receive the last belief. It is lost with the process if a reader has not
-/// connected to it yet.
+/// Maximum time that [`Feed::end`] waits for readers to receive the last belief. A reader that has not connected by
+/// then cannot receive it once the process has ended.
 const FAREWELL: Duration = Duration::from_millis(500);
 
 /// The beliefs that the agents of one process publish.
@@ -41,8 +41,8 @@ pub struct View<'a> {
 }
 
 impl Feed {
-    /// Opens the channel for beliefs like this one. If it cannot be opened, it logs one warning and publishes nothing,
-    /// because acting does not depend on being observed.
+    /// Opens the channel for beliefs of the same size as `belief`. If it cannot be opened, it logs one warning and
+    /// publishes nothing, because acting does not depend on being observed.
     pub fn open(instance: &Instance, belief: &Probabilities) -> Self {
         // The intent is a few hundred bytes of text.
         let n_bytes = belief.len() * size_of::<f32>() + 1024;
@@ -55,7 +55,7 @@ impl Feed {
         }
     }
 
-    /// Returns whether a belief is due, and there are readers.
+    /// Returns whether a belief is due and there are readers.
     pub fn is_due(&self) -> bool {
         !self.due(1).is_empty()
     }
@@ -108,8 +108,8 @@ impl Feed {
 }
 
 impl Turns {
-    /// Returns the worlds that are due, in rotation. They are at most as many as a reader's buffer can hold next to an
-    /// unread one.
+    /// Returns the worlds that are due, in rotation. There are at most as many as fit in a reader's buffer together
+    /// with one unread belief.
     fn due(&self, now: Instant, n_worlds: usize) -> Vec<usize> {
         let share = |shown: Instant| (now - shown).as_secs_f64() / INTERVAL.as_secs_f64();
         let n_due = self
@@ -131,9 +131,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn worlds_take_turns_and_each_is_shown_once_in_an_interval() {
+    fn worlds_take_turns_and_each_is_shown_once_per_interval() {
         let (mut turns, now) = (Turns::default(), Instant::now());
-        assert_eq!(turns.due(now, 5), [0], "the first at once");
+        assert_eq!(turns.due(now, 5), [0], "the first world is due at once");
         turns.pass(now);
         let nothing: [usize; 0] = [];
         assert_eq!(turns.due(now + INTERVAL / 6, 5), nothing);
@@ -142,10 +142,10 @@ mod tests {
         assert_eq!(
             turns.due(now + INTERVAL * 9, 5),
             [1, 2, 3],
-            "a reader's buffer"
+            "limited by a reader's buffer"
         );
         (1..5).for_each(|_| turns.pass(now));
-        assert_eq!(turns.due(now + INTERVAL / 4, 5), [0], "and from the start");
+        assert_eq!(turns.due(now + INTERVAL / 4, 5), [0], "and again from 0");
         let almost = now + INTERVAL - Duration::from_micros(1);
         assert_eq!(turns.due(almost, 1), nothing);
         assert_eq!(turns.due(now + INTERVAL, 1), [0]);

@@ -12,7 +12,7 @@ pub type Ipc = ipc_threadsafe::Service;
 #[derive(Debug, Clone, Copy, Default)]
 pub struct WireHeader<H>(pub H);
 
-#[expect(unsafe_code, reason = "iceoryx2 asks for a promise")]
+#[expect(unsafe_code, reason = "iceoryx2 requires an unsafe trait")]
 // SAFETY: a header is plain bytes (`Pod`), so it has no pointers and no destructor.
 unsafe impl<H: Header> ZeroCopySend for WireHeader<H> {
     unsafe fn type_name() -> &'static str {

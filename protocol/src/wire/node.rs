@@ -45,7 +45,7 @@ pub(crate) struct Opened<T> {
 }
 
 impl<T> Opened<T> {
-    /// Wraps the ports of a node with these entries.
+    /// Wraps the ports of the node that has these entries.
     pub(crate) fn new(entries: Entries, ports: T) -> Self {
         Self {
             ports: Some(ports),
@@ -84,7 +84,7 @@ impl<T> Drop for Opened<T> {
     }
 }
 
-/// Checks that shared memory with this prefix belongs to this user, and removes the access of all others.
+/// Checks that shared memory with this prefix belongs to this user, and revokes the access of all other users.
 fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelError> {
     let entries = std::fs::read_dir(folder).map_err(|error| not_usable(folder, error))?;
     for entry in entries.flatten() {
@@ -120,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shared_memory_of_the_prefix_is_closed_to_others() {
+    fn shared_memory_with_the_prefix_is_closed_to_other_users() {
         let folder = std::env::temp_dir().join(format!("emberwatch-shm-{}", std::process::id()));
         std::fs::create_dir(&folder).expect("a new directory");
         let make = |name: &str| {

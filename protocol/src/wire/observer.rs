@@ -26,7 +26,7 @@ const BUSY_INTERVAL: Duration = Duration::from_micros(500);
 /// server may need.
 const IDLE_INTERVAL: Duration = Duration::from_millis(4);
 
-/// Time that an observer stays busy after it began, and after it found more than a quarter of its buffer full.
+/// Time that an observer stays busy after it was opened, and after it found more than a quarter of its buffer full.
 const BUSY: Duration = Duration::from_secs(1);
 
 type Ports<H> = (Subscriber<Ipc, [u8], WireHeader<H>>, Node<Ipc>);
@@ -45,7 +45,7 @@ struct Polling {
     is_eager: bool,
     /// Samples since the last sleep.
     n_found: Cell<usize>,
-    /// When the observer was last found busy.
+    /// The time at which the observer was last found busy.
     busy: Cell<Instant>,
 }
 
@@ -123,16 +123,16 @@ impl<H: Header> Observer<H> {
         })
     }
 
-    /// Makes the observer always poll every 500 us. This is for observers that must not miss the first samples after a
-    /// pause, when the server may publish more than a buffer within the usual 4 ms.
+    /// Makes the observer always poll every 500 us. Use it if the first samples after a pause must not be lost: within
+    /// the usual 4 ms, the server may publish more samples than the buffer can hold.
     #[must_use]
     pub fn eager(mut self) -> Self {
         self.polling.is_eager = true;
         self
     }
 
-    /// Waits for the next sample. Returns `None` if none came in time. Gaps in the headers' sequence numbers are
-    /// samples that this observer lost because it was too slow.
+    /// Waits for the next sample. Returns `None` if none came in time. A gap in the headers' sequence numbers means
+    /// that this observer was too slow and lost samples.
     ///
     /// # Errors
     /// If iceoryx2 cannot read the channel, or its files were removed.
@@ -206,7 +206,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_observer_polls_often_while_busy_and_for_a_second_after() {
+    fn an_observer_polls_often_until_a_second_after_it_was_busy() {
         let began = Instant::now();
         let mut polling = Polling {
             buffer: 64,

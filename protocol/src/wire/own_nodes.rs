@@ -1,5 +1,5 @@
-//! The ids of this process's nodes. Process numbers are not enough, because a process in another PID namespace may have
-//! the same number.
+//! The ids of this process's nodes. Process ids are not enough, because a process in another PID namespace may have the
+//! same id.
 
 use std::collections::HashSet;
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};

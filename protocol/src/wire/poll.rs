@@ -9,7 +9,7 @@ use std::time::Duration;
 /// descriptor whether it is readable.
 ///
 /// # Errors
-/// If the system cannot wait; never `EINTR`.
+/// If the system cannot wait. The error is never `EINTR`.
 pub fn sleep_until_readable(
     descriptors: &[BorrowedFd<'_>],
     timeout: Duration,
@@ -20,10 +20,10 @@ pub fn sleep_until_readable(
     }
 }
 
-/// Sleeps like [`sleep_until_readable`]. Returns whether a descriptor is readable or a signal arrived.
+/// Sleeps as [`sleep_until_readable`] does. Returns whether a descriptor is readable or a signal arrived.
 ///
 /// # Errors
-/// If the system cannot wait; never `EINTR`.
+/// If the system cannot wait. The error is never `EINTR`.
 pub fn sleep_until_event(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> Result<bool, Errno> {
     match readable(descriptors, timeout) {
         Err(Errno::INTR) => Ok(true),

@@ -21,7 +21,7 @@ pub enum NotWatched {
         /// The process id.
         pid: i32,
     },
-    /// The system does not allow it.
+    /// The system does not allow watching the process.
     #[error("--exit-with {pid}: {problem}")]
     Refused {
         /// The process id.
@@ -81,7 +81,8 @@ pub(super) fn watch_error(errno: Errno) -> ChannelError {
     call_error("pidfd_open", errno)
 }
 
-/// Returns the process of an iceoryx2 node or port from its id. The number is valid in that process's PID namespace.
+/// Returns the process of an iceoryx2 node or port from its id. The process id is valid in that process's PID
+/// namespace.
 pub fn node_pid(id: u128) -> i32 {
     (id >> 64) as i32
 }
@@ -89,12 +90,12 @@ pub fn node_pid(id: u128) -> i32 {
 /// Returns a process's state in `/proc`, such as `R` or `Z`, or `None` if there is no such process.
 pub(crate) fn process_state(pid: i32) -> Result<Option<char>, Error> {
     let stat = if_there(std::fs::read_to_string(format!("/proc/{pid}/stat")))?;
-    // The state follows the name, which is in brackets and may contain brackets.
+    // The state follows the name, which is in brackets and may itself contain brackets.
     Ok(stat.and_then(|stat| stat.rsplit_once(") ")?.1.chars().next()))
 }
 
-/// Returns what was read, or `None` if it does not exist. Other errors are returned, because they do not show that it
-/// is missing.
+/// Returns the result of reading a file, or `None` if the file does not exist. Other errors are returned, because they
+/// do not prove that the file is missing.
 pub(crate) fn if_there<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     match read {
         Ok(found) => Ok(Some(found)),

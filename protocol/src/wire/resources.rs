@@ -23,22 +23,22 @@ const PORT_BYTES: u64 = 512 << 10;
 /// Number of files of these ports. Measured: 25.
 const PORT_FILES: u64 = 48;
 
-/// Number of file descriptors of a connection to a server or an agent. Measured: 31, and one more for a moment.
+/// Number of file descriptors of a connection to a server or an agent. Measured: 31, and briefly one more.
 pub(super) const CLIENT_DESCRIPTORS: usize = 33;
 
-/// Number of file descriptors of an observer. Measured: 9, and 3 more for a moment.
+/// Number of file descriptors of an observer. Measured: 9, and briefly 3 more.
 pub(super) const OBSERVER_DESCRIPTORS: usize = 12;
 
 /// Number of file descriptors that a server needs for one more client.
 pub(super) const SERVER_DESCRIPTORS: usize = 10;
 
-/// If fewer descriptors than this are free, their lack is the likely reason for an error of iceoryx2.
+/// If fewer file descriptors than this are free, their shortage is the likely reason for an error of iceoryx2.
 const FEW_DESCRIPTORS: usize = 10;
 
 /// Checks that there is enough shared memory for the ports of a connection, and for a message on them.
 ///
 /// # Errors
-/// If there is too little.
+/// If less is available.
 pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelError> {
     let n_bytes = PORT_BYTES + message_bytes as u64;
     check_room(n_bytes, n_bytes)
@@ -48,7 +48,7 @@ pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelEr
 /// file may have `longest_file` bytes.
 ///
 /// # Errors
-/// If there is too little.
+/// If less is available.
 pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
     let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
     if limit < longest_file {
@@ -73,7 +73,7 @@ pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
 /// Checks that `n_bytes` bytes of shared memory are free.
 ///
 /// # Errors
-/// If there is too little.
+/// If less is available.
 pub(super) fn check_free(n_bytes: u64) -> Result<(), ChannelError> {
     let Ok(found) = statvfs(SHARED_MEMORY) else {
         return Ok(());
@@ -97,7 +97,8 @@ pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
     limited_error(what, "64 processes")
 }
 
-/// Adds context like [`ipc_error`], for resources with a limited count. `most` is the limit, such as `16 clients`.
+/// Adds context as [`ipc_error`] does, for resources whose number is limited. `most` is the limit, such as `16
+/// clients`.
 pub fn limited_error<E: Debug>(
     what: &'static str,
     most: &'static str,
@@ -123,13 +124,13 @@ fn check_sockets() -> Result<(), ChannelError> {
     errno.map_or(Ok(()), |errno| Err(call_error("socket (AF_UNIX)", errno)))
 }
 
-/// Checks that `needed` descriptors are free before any is used: descriptors of an unfinished operation of iceoryx2 may
-/// stay open.
+/// Checks that `needed` descriptors are free before any is used. If an operation of iceoryx2 fails halfway, its
+/// descriptors may stay open.
 pub(super) fn check_descriptors(what: &'static str, needed: usize) -> Result<(), ChannelError> {
     free_descriptors(needed).map_err(|_| no_descriptors(what, needed))
 }
 
-/// Returns the error of a system call that does not depend on a file.
+/// Returns the error for a failed system call that is not about a file.
 pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
     match errno {
         Errno::MFILE | Errno::NFILE => no_descriptors(call, CLIENT_DESCRIPTORS),
@@ -140,7 +141,7 @@ pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
     }
 }
 
-/// Returns the error of a process that cannot open more files.
+/// Returns the error for a process that cannot open more files.
 pub(super) fn no_descriptors(what: &'static str, needed: usize) -> ChannelError {
     let limit = getrlimit(Resource::Nofile).current;
     ChannelError::NoDescriptors {

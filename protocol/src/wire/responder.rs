@@ -20,13 +20,13 @@ use serde::Serialize;
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-/// Maximum size of a JSON answer in bytes before its segment grows.
+/// Initial maximum size of a JSON answer in bytes. A longer answer makes its segment grow.
 pub const JSON_SLICE: usize = 16_384;
 
-/// Maximum number of known listeners, after which the table is emptied.
+/// Maximum number of known listeners. A full table is emptied.
 const MAX_KNOWN_LISTENERS: usize = 1024;
 
-/// Maximum time in which clients must read an answer before its sender ends.
+/// Maximum time that a sender waits for clients to read its last answers before it ends.
 const LAST_ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A request that is waiting for its answer.
@@ -161,7 +161,7 @@ pub fn control_server(
         .create()
 }
 
-/// Returns the node that owns a service's only answering port, if that is why another could not be created.
+/// Returns the node that owns a service's only answering port, if `error` means that this port already exists.
 pub fn port_owner<Q: Header, R: Header>(
     service: &RequestResponse<Q, R>,
     error: &ServerCreateError,

@@ -16,7 +16,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 /// The memory of one port's messages. The messages are stored consecutively at its end, and a new message takes the
-/// first free place. So memory for the first ones is enough as long as no more are in use.
+/// first free place. So memory for the first `n` messages is enough while at most `n` messages are in use.
 #[derive(Debug)]
 pub struct MessageMemory {
     path: PathBuf,
@@ -27,8 +27,8 @@ pub struct MessageMemory {
     n_ready: Cell<u64>,
 }
 
-/// Allocates memory for everything that a node's ports and services write to; for a server without the memory of
-/// messages.
+/// Allocates memory for everything that a node's ports and services write to. The memory of messages is included only
+/// if `with_messages` is set. Programs with large messages allocate it with [`MessageMemory`] instead.
 ///
 /// # Errors
 /// If there is not enough memory.
@@ -53,7 +53,8 @@ pub fn fill_ports(node: &Node<Ipc>, with_messages: bool) -> Result<(), ChannelEr
 }
 
 impl MessageMemory {
-    /// Finds the memory of a port that holds at least `n_messages` messages of at least `message_bytes` bytes.
+    /// Finds the memory of a port, which must have space for at least `n_messages` messages of at least `message_bytes`
+    /// bytes.
     ///
     /// # Errors
     /// If the port has no such file.

@@ -8,24 +8,24 @@
 
 use std::time::{Duration, Instant};
 
-/// Time to poll before blocking. It is longer than the wake-up of a process that answers at once, so that two processes
-/// that block find out that spinning pays.
+/// Time to poll before blocking. It is longer than it takes to wake a process that answers at once, so that two
+/// processes that block can find out that spinning pays.
 const SPIN: Duration = Duration::from_micros(100);
 
-/// If the time between two polls exceeds this, a busy process had the core meanwhile. It is less than a time slice, and
-/// more than short work takes, such as handing a snapshot to a writer.
+/// If the time between two polls exceeds this, a busy process had the core meanwhile. It is shorter than a time slice,
+/// and longer than short pieces of work, such as handing a snapshot to a writer.
 const LOST_CORE: Duration = Duration::from_millis(1);
 
 /// Number of consecutive waits longer than [`SPIN`] after which spinning does not pay.
 const VAIN_SPINS: u32 = 3;
 
-/// Time for which waits then block at once, before one wait tries spinning again.
+/// Time for which waits then block at once. After it, one wait tries spinning again.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// The record of earlier waits, from which the next ones decide whether to spin.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Spinning {
-    /// When this wait began, and its last poll; `None` if it does not spin, or has stopped spinning.
+    /// The times when this wait began and last polled. `None` if it does not spin, or has stopped spinning.
     wait: Option<(Instant, Instant)>,
     n_vain: u32,
     not_before: Option<Instant>,
@@ -38,7 +38,8 @@ impl Spinning {
         self.wait = may_spin.then_some((now, now));
     }
 
-    /// Returns whether to poll again at once, if nothing has arrived yet. If not, block.
+    /// Called while nothing has arrived. Returns true if the caller should poll again at once, and false if it should
+    /// block.
     pub fn keeps_spinning(&mut self, now: Instant) -> bool {
         let Some((start, last)) = self.wait else {
             return false;
@@ -90,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wait_spins_for_a_while_and_waits_block_at_once_after_three_in_vain() {
+    fn after_three_vain_spins_waits_block_at_once() {
         let in_vain = (0, &[1, 50, 99, 100, 101][..], Some(100), false);
         check(&[
             in_vain,
@@ -110,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn what_arrives_while_spinning_alone_makes_up_for_spins_in_vain() {
+    fn only_an_arrival_while_spinning_resets_the_vain_spins() {
         let in_vain = (0, &[0, 100][..], Some(100), false);
         let arrives = (0, &[0, 99][..], None, true);
         check(&[in_vain, in_vain, arrives].repeat(10));

@@ -19,7 +19,7 @@ use rustix::io::Errno;
 use serde::Deserialize;
 use std::time::Duration;
 
-/// Maximum size of a request in bytes before its segment grows.
+/// Initial maximum size of a request in bytes. A longer request makes its segment grow.
 const SLICE: usize = 4096;
 
 const WHAT: &str = "a control request";
@@ -31,7 +31,7 @@ pub(super) struct TextPort {
     pub(super) exchange: Exchange,
 }
 
-/// The fields of refusals and of `hello` that are read here.
+/// The fields of a refusal or of a reply to `hello` that this module reads.
 #[derive(Deserialize, Default)]
 struct Common {
     #[serde(default)]

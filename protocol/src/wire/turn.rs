@@ -17,7 +17,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Maximum wait for other processes, each of which takes milliseconds.
+/// Maximum wait for other processes, each of which holds the turn for milliseconds.
 const LONGEST_WAIT: Duration = Duration::from_secs(10);
 
 /// Maximum wait before closing and cleaning up, which can also be done without a turn, or by the next program.
@@ -44,15 +44,15 @@ enum Held {
     Unlocked,
 }
 
-/// Whether a thread of this process has its turn, or forks. The child of a fork during a turn would inherit a lock that
-/// nobody in it unlocks. The flag is an atomic that is polled, because these survive a fork.
+/// Set while a thread of this process has a turn or forks. If a process forked during a turn, its child would inherit a
+/// lock that no thread of the child unlocks. The flag is a polled atomic, because a mutex would not survive a fork.
 static BUSY: AtomicBool = AtomicBool::new(false);
 
 thread_local! {
     static HELD: Cell<Held> = const { Cell::new(Held::No) };
 }
 
-/// A turn, which ends when it is dropped. A turn within another turn of the same thread is part of it.
+/// A turn, which ends when it is dropped. A turn within another turn of the same thread is part of the outer turn.
 #[derive(Debug)]
 pub struct Turn {
     is_outermost: bool,
@@ -76,7 +76,7 @@ pub fn after_fork() {
 }
 
 impl Turn {
-    /// Waits for a turn, but not for a stopped or frozen process that has it.
+    /// Waits for a turn. If a stopped or frozen process has the turn, continues without it.
     ///
     /// # Errors
     /// If other processes hold the lock for too long, or the directory is not writable.
@@ -84,12 +84,12 @@ impl Turn {
         Self::take_within(LONGEST_WAIT)
     }
 
-    /// Waits like [`Self::take`], with a maximum wait.
+    /// Waits as [`Self::take`] does, but at most `limit`.
     pub(crate) fn take_within(limit: Duration) -> Result<Self, ChannelError> {
         Self::take_unless(limit, check_interrupt)
     }
 
-    /// Waits like [`Self::take`], with a short maximum wait and without interrupts: to close ports and to clean up.
+    /// Waits as [`Self::take`] does, but only shortly and without interrupts. It is for closing ports and cleaning up.
     pub(crate) fn take_to_end() -> Result<Self, ChannelError> {
         Self::take_unless(SHORT_WAIT, || Ok(()))
     }
@@ -125,7 +125,7 @@ impl Turn {
 impl Drop for Turn {
     fn drop(&mut self) {
         if let Some(lock) = &self.lock {
-            // Closing alone is not enough, because the child of a fork may have a copy.
+            // Closing the file is not enough, because the child of a fork may have a copy of the descriptor.
             let _ = flock(lock, FlockOperation::Unlock);
         }
         if self.is_outermost {
@@ -149,7 +149,7 @@ fn wait(
         let file = open(path, flags, Mode::RUSR | Mode::WUSR).map_err(wrong)?;
         match flock(&file, FlockOperation::NonBlockingLockExclusive) {
             Ok(()) if is_file(&file, path) => return Ok(Some(file)),
-            Ok(()) => continue, // The file was removed meanwhile, and others lock a new file.
+            Ok(()) => continue, // The file was removed meanwhile, and other processes lock a new file.
             Err(Errno::WOULDBLOCK | Errno::INTR) => {}
             Err(errno @ (Errno::PERM | Errno::ACCESS | Errno::NOSYS)) => {
                 return Err(call_error("flock", errno));
@@ -213,7 +213,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_turn_is_waited_for_and_its_holder_named() {
+    fn a_wait_for_a_turn_times_out_and_names_the_holder() {
         let path = std::env::temp_dir().join(format!("emberwatch-turn-{}", std::process::id()));
         let first = wait(&path, Duration::ZERO, || Ok(())).expect("nobody has it");
         let refusal = wait(&path, Duration::from_millis(1), || Ok(())).expect_err("it is taken");
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_ends_though_a_copy_of_its_file_stays_open() {
+    fn a_turn_ends_even_if_a_copy_of_its_file_stays_open() {
         let turn = Turn::take().expect("a turn");
         let copy = turn.lock.as_ref().map(|lock| lock.try_clone());
         let copy = copy.expect("it is alone").expect("a copy, as a child has");
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fork_waits_for_the_turns_of_other_threads_and_they_for_it() {
+    fn a_fork_and_the_turns_of_other_threads_exclude_each_other() {
         before_fork();
         let (sender, receiver) = std::sync::mpsc::channel();
         std::thread::scope(|scope| {

@@ -1,4 +1,4 @@
-//! The bounded wait of both sides: spin while that pays, then block, never longer than a deadline.
+//! The wait of servers and clients: spins while that pays, then blocks, but never beyond a deadline.
 
 use super::ipc::Ipc;
 use super::resources::ipc_error;
@@ -21,7 +21,7 @@ pub struct Waiter {
 impl Waiter {
     /// Polls until something arrives. Returns `None` if the timeout passes before that.
     ///
-    /// `block` may sleep for at most the duration that it is given. It is called repeatedly until the timeout, so it
+    /// `block` must not sleep longer than the duration passed to it. It is called repeatedly until the timeout, so it
     /// may return early for any reason.
     ///
     /// # Errors
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_wait_ends_with_what_arrives_an_error_or_its_timeout() {
+    fn a_wait_ends_with_a_result_an_error_or_a_timeout() {
         let (mut calls, long) = (0, Duration::from_secs(9));
         let third = || {
             calls += 1;

@@ -22,7 +22,7 @@ pub struct Field {
     pub of: String,
 }
 
-/// Returns the cells of each row of the one table whose header line begins like this.
+/// Returns the cells of each row of the only table whose header line begins with `header`.
 pub fn rows_under(header: &str) -> Vec<Vec<String>> {
     let (_, rest) = PROTOCOL.split_once(&format!("\n{header}")).expect(header);
     assert!(!rest.contains(&format!("\n{header}")), "two {header}");
@@ -50,7 +50,7 @@ pub fn documented_struct(name: &'static str) -> (Layout, String) {
     (layout, parts[2].into())
 }
 
-/// Returns the fields in the one byte table whose header line begins like this.
+/// Returns the fields in the only byte table whose header line begins with `header`.
 pub fn fields_under(header: &str) -> Vec<Field> {
     rows_under(header).into_iter().map(field).collect()
 }
@@ -64,7 +64,7 @@ fn field(row: Vec<String>) -> Field {
     }
 }
 
-/// Returns the fenced blocks of a language, with the title after the language and the text.
+/// Returns the fenced blocks of a language. Each has the title after the language, and the text.
 pub fn fences(language: &str) -> Vec<(&'static str, &'static str)> {
     let blocks = PROTOCOL.split("\n```").skip(1).step_by(2);
     blocks
@@ -92,7 +92,7 @@ pub fn sizes_of_struct_format(format: &str) -> Vec<usize> {
     sizes
 }
 
-/// Returns the sizes of a struct's numbers, with nested structs flattened.
+/// Returns the sizes of a struct's scalars, with nested structs flattened.
 pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
     let of_field = |field: &Field| match field.of.as_str() {
         "u16" => vec![2],
@@ -104,7 +104,7 @@ pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
     layout.fields.iter().flat_map(of_field).collect()
 }
 
-/// Returns the bytes of a worked example. Checks the names of its fields, and each value against its bytes.
+/// Returns the bytes of a worked example. Checks the names of its fields, and that each value matches its bytes.
 pub fn worked_example(name: &'static str) -> Vec<u8> {
     let mut blocks = fences("hex").into_iter();
     let (_, text) = blocks.find(|(title, _)| title.trim() == name).expect(name);
@@ -166,7 +166,7 @@ fn bytes_of_hex(text: &str) -> Vec<u8> {
     text.split(' ').map(byte).collect()
 }
 
-/// Returns the rows of a table whose header line begins before `rest`.
+/// Returns the rows of a table. `rest` is the document from within the table's header line.
 fn rows(rest: &str) -> Vec<Vec<String>> {
     let lines = rest.lines().skip(2);
     let cells = |line: &str| {

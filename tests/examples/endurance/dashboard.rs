@@ -1,4 +1,4 @@
-//! Measures what a dashboard costs the simulator, with and without a browser, and what it uses itself.
+//! Measures how much a dashboard, with and without a browser, slows the simulator, and what resources it uses.
 
 use crate::observers::table;
 use std::time::Instant;
@@ -7,7 +7,7 @@ use tests::harness::{Program, Server};
 use tests::meter::{Use, processor_seconds};
 use tests::report::say;
 
-/// A dashboard on a server, optionally with a browser. Prints on drop what the dashboard used.
+/// A dashboard on a server, optionally with a browser. On drop, prints the resources that the dashboard used.
 struct Audience {
     dashboard: Program,
     browser: Option<Program>,
@@ -15,7 +15,7 @@ struct Audience {
     _profile: TempDir,
 }
 
-/// Compares the time of a step without a dashboard, with a dashboard, and with one shown in Chromium, on a square grid.
+/// Compares the time of a step on a square grid without a dashboard, with one, and with one that Chromium shows.
 pub fn compare(n_rounds: usize, side: usize) {
     let audience = |with_dashboard: bool, with_browser: bool| {
         move |server: &Server| with_dashboard.then(|| Audience::attend(server, with_browser))

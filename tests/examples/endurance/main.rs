@@ -1,4 +1,4 @@
-//! Measures what observers, dashboards and snapshots cost a server, and what hours of changing clients do.
+//! Measures the cost of observers, dashboards and snapshots to a server, and the effect of hours of changing clients.
 //!
 //! `cargo run --release -p tests --example endurance -- observers 5 | dashboard 5 64 | snapshots 9 | soak 3600 FOLDER`
 

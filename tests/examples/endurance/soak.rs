@@ -1,5 +1,5 @@
-//! Runs for hours agents and observers that come, go, are killed, stopped and taken over, together with snapshots.
-//! Writes what the server uses, second by second, as a CSV file and as a figure.
+//! Runs a server for hours while agents and observers start, end, are killed, stopped and taken over, and snapshots are
+//! written. Writes the server's resource usage, second by second, as a CSV file and as a figure.
 
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use rand::RngExt;

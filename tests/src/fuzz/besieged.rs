@@ -1,7 +1,7 @@
 //! A simulator under attack, with a victim that acts on its own world and shares another world with an attacker.
 //!
-//! The simulator is kept between inputs, so that leases, resets and episodes reach every state. It is replaced after
-//! some inputs, so that a failure can be reproduced from few inputs.
+//! Successive inputs go to the same simulator, so that leases, resets and episodes reach every state. After some inputs
+//! a new simulator replaces it, so that a failure can be reproduced from few inputs.
 
 use crate::mirror::step_again;
 use crate::wire::{step_body, step_header};
@@ -25,9 +25,9 @@ use std::time::{Duration, Instant};
 
 pub const N_MOVES: usize = 4;
 pub const N_ROBOTS: usize = 2;
-/// Two worlds of the attackers, the shared world and the victim's world.
+/// Number of worlds: two worlds of the attackers, the shared world and the victim's world.
 pub const N_WORLDS: u32 = 4;
-/// The shared world, whose first robot the attacker holds and whose second robot the victim holds.
+/// The shared world. The attacker holds its first robot, and the victim its second robot.
 pub const SHARED: usize = 2;
 /// The victim's world.
 const HOME: usize = 3;
@@ -37,10 +37,10 @@ pub const N_THEIRS: u32 = (SHARED * N_ROBOTS + 1) as u32;
 /// Deadline of the shared world.
 const DEADLINE: Duration = Duration::from_millis(50);
 
-/// Number of inputs for one simulator.
+/// Number of inputs after which the simulator is replaced.
 const N_INPUTS: usize = 256;
 
-/// The victim steps once per this many inputs.
+/// Number of inputs from one step of the victim to the next.
 const VICTIM_STEPS: usize = 8;
 
 /// The two undisturbed clients: the victim in its own world, and its second client in the shared world.
@@ -58,11 +58,11 @@ pub struct Siege {
     pub pending: Vec<(ClientId, PendingReply)>,
     /// The victim's lease, then the attackers' latest leases, then the victim's lease in the shared world.
     pub leases: [u64; 4],
-    /// The attacker's waiting step, and since when it waits.
+    /// The attacker's waiting step, and the time at which it was sent.
     pub attackers_step: Option<(Ticket, Instant)>,
     /// The victim's waiting step in the shared world, and its path.
     shared_step: Option<(Ticket, Vec<u8>)>,
-    /// The expected shared world.
+    /// The expected state of the shared world.
     mirror: Episode,
     n_inputs: usize,
 }
@@ -172,7 +172,7 @@ impl Siege {
         }
     }
 
-    /// Steps the victim's world, which must evolve as if alone, and sends or cancels a step in the shared world.
+    /// Steps the victim's world, which must evolve as if alone. Then sends or cancels a step in the shared world.
     fn victim_steps(&mut self) {
         static QUIET: OnceLock<Vec<(StepReply, Vec<u8>)>> = OnceLock::new();
         let steps = QUIET.get_or_init(|| {
@@ -253,10 +253,10 @@ impl Siege {
         assert!(is_due, "the victim was not waited for");
     }
 
-    /// If the shared world has stepped, repeats the step in the mirror, with the given path of the victim or none.
+    /// If the shared world has stepped, repeats the step in the mirror. `path` is the victim's path, if answered.
     fn check_shared_step(&mut self, path: Option<&[u8]>) {
         let episode = self.simulator.episode(SHARED);
-        let episode = episode.expect("nobody but who holds both robots resets it");
+        let episode = episode.expect("only a client that holds both robots can reset it");
         let result = world_result(episode.outcome());
         if result.step == self.mirror.outcome().step {
             assert_eq!(path, None, "the victim's path was answered, but not flown");
@@ -264,7 +264,7 @@ impl Siege {
             let stayed = result.hovered | result.late;
             assert_eq!(result.hovered & 2, 0, "the victim holds its robot");
             let flown = (stayed & 2 == 0).then(|| path_to_bytes(episode.robots()[1].path()));
-            assert_eq!(flown.as_deref(), path, "not the victim's path");
+            assert_eq!(flown.as_deref(), path, "the flown path is not the victim's");
             let robots = episode.robots().iter();
             let robots = robots.map(|robot| (robot.path().to_vec(), robot_result(robot.outcome())));
             let rules = &self.simulator.spec().rules;

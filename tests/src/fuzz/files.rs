@@ -25,7 +25,7 @@ use std::collections::BTreeMap;
 /// Number of simulated steps of a model.
 const N_STEPS: u64 = 8;
 
-/// Checks that a model file is refused, or can be written, read again, simulated and filtered.
+/// Checks that a model file is refused, or that its model can be written, read again, simulated and filtered.
 pub fn model(bytes: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(bytes) else {
         return false;
@@ -50,7 +50,7 @@ pub fn model(bytes: &[u8]) -> bool {
     true
 }
 
-/// Checks that predictions from certain beliefs and from the uniform belief are valid beliefs.
+/// Checks that predictions from one-hot beliefs and from the uniform belief are valid beliefs.
 fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition<f32>) {
     let dim = (model.n_states(), shape.height(), shape.width());
     let mut next = Array3::zeros(dim);
@@ -115,7 +115,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         let n_matrices = filter.tables.dimensions.n_matrices as f64;
         let sums = likelihood.sum_axis(Axis(1)) / n_matrices;
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
-        // Checkpoints of decisions also hold a filter, but a filter learner resumes only from its own checkpoints.
+        // Checkpoints of decisions also contain a filter, but a filter learner resumes only from a filter's checkpoint.
         if learners::filter::FILTER.checkpoints.contains(&&*kind) {
             learn(&contents, filter.tables.dimensions.sees_own_state);
         }
@@ -167,7 +167,7 @@ fn config() -> AgentConfig {
     config.learning.window = 2;
     config.learning.block_windows = 1;
     config.learning.streams = 2;
-    // Small networks keep the files of the corpus small.
+    // With small networks, the files of the corpus stay small.
     config.decisions.learning.width = 1;
     config
 }
@@ -198,7 +198,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
         n_matrices: 2,
         ..dimensions(false)
     };
-    // The large autoencoder guards against a claimed size of 30 GiB.
+    // The large autoencoder claims a size of 30 GiB, which no decoder may allocate.
     [
         ("filter", "learned_filter", filter(dimensions(false))),
         ("own_filter", "learned_own_filter", filter(dimensions(true))),

@@ -1,4 +1,4 @@
-//! Fuzz targets for the messages that clients and observers read: answers, frames, replies.
+//! Fuzz targets for the messages that clients and observers read.
 
 use bytemuck::{Pod, bytes_of};
 use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
@@ -28,7 +28,7 @@ pub fn split_header<H: Pod>(bytes: &[u8]) -> Option<(H, &[u8])> {
     Some((bytemuck::pod_read_unaligned(header), payload))
 }
 
-/// Checks that an answer to a step splits completely into its parts, and that its frames hold valid observations.
+/// Checks that an answer to a step splits completely into its parts, and that its frames contain valid observations.
 pub fn step_answer(bytes: &[u8]) -> bool {
     let Some((reply, payload)) = split_header::<StepReply>(bytes) else {
         return false;

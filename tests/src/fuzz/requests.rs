@@ -22,7 +22,7 @@ pub fn step(bytes: &[u8]) -> bool {
     split_header(bytes).is_some_and(|(request, body)| on_siege(|siege| siege.step(&request, body)))
 }
 
-/// Handles a byte that selects the client and the events before, and then a control request.
+/// Handles a control request. The first byte selects the client, and the events that precede the request.
 pub fn control(bytes: &[u8]) -> bool {
     bytes
         .split_first()
@@ -78,7 +78,7 @@ impl Siege {
         true
     }
 
-    /// Adds the current steps of the worlds to the steps in a payload.
+    /// Adds the worlds' current steps to the relative steps in a payload.
     fn body_from_present(&self, request: &StepRequest, body: &[u8]) -> Vec<u8> {
         let mut body = body.to_vec();
         let end = u64::from(request.first_robot) + u64::from(request.n_robots);
@@ -169,7 +169,7 @@ impl Siege {
         }
     }
 
-    /// Stores the pending request of a client, which replaces its previous one: a client has one at a time.
+    /// Stores a client's pending request in place of the previous one, because a client has one request at a time.
     fn wait_for(&mut self, who: usize, pending: PendingReply) {
         let client = ATTACKERS[who];
         let mut waiting = self.pending.iter();
@@ -181,7 +181,7 @@ impl Siege {
     }
 }
 
-/// Replaces the placeholder in a text by the lease.
+/// Replaces the placeholder in a text with the lease.
 fn replaced(text: &[u8], lease: &str) -> Vec<u8> {
     let mut words = text.windows(LEASE.len());
     let Some(at) = words.position(|word| word == LEASE.as_bytes()) else {

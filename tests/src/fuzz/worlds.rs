@@ -79,7 +79,7 @@ fn flown(ready: u64, full: u64) -> Flown<'static> {
     }
 }
 
-/// Checks that a recording is refused or read to its end, after correcting its checksums.
+/// Corrects a recording's checksums, then checks that the recording is refused or read to its end.
 pub fn recording(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     mend(&mut bytes);

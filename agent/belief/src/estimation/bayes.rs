@@ -18,7 +18,7 @@ pub struct ZeroEvidence {
     pub belief: Vec<f32>,
 }
 
-/// Like [`ZeroEvidence`], with the cell's index and probabilities of any number type.
+/// The generic form of [`ZeroEvidence`]: a cell's row-major index, and probabilities of any float type.
 #[derive(Debug, PartialEq)]
 pub struct Impossible<T> {
     pub index: usize,
@@ -51,7 +51,7 @@ pub fn observations(belief: &Belief, likelihood: &Array2<f64>) -> Probabilities 
 /// [`ZeroEvidence`] if `b(y)' u = 0` for some cell. The belief is then unchanged.
 ///
 /// # Panics
-/// If the frame has another grid, or an observation that the likelihood lacks.
+/// If the frame's grid differs from the belief's, or the likelihood lacks one of the frame's observations.
 pub fn correct(
     belief: &mut Belief,
     likelihood: &Array2<f64>,
@@ -68,8 +68,8 @@ pub fn correct(
     })
 }
 
-/// Like [`correct`], for any list of cells. `probabilities` holds one block of cells per state. `observed` lists the
-/// index and the value of each observed cell.
+/// Applies Bayes' rule as [`correct`] does, but to any list of cells. `probabilities` contains one contiguous block of
+/// cells per state. `observed` lists the index and the value of each observed cell.
 ///
 /// # Errors
 /// [`Impossible`] for the first cell where `b(y)' u` is 0 or not finite. The probabilities are then unchanged.
@@ -83,12 +83,12 @@ pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
 ) -> Result<(), Impossible<T>> {
     let n_states = likelihood.nrows();
     let n_cells = probabilities.len() / n_states;
-    // Written back only after the whole frame has proved possible.
+    // Posteriors are written back only after all observations have proved possible.
     let mut posteriors: Vec<T> = Vec::new();
     for (index, observed) in observed() {
         let prior = probabilities[index..].iter().step_by(n_cells);
         let likelihood = likelihood.column(usize::from(observed));
-        // Computed in f64, where the product of two f32 cannot underflow to zero.
+        // Computed in f64, where the product of two f32 values cannot underflow to zero.
         let joint = || {
             let pairs = prior.clone().zip(&likelihood);
             pairs.map(|(&u, b)| u.to_f64().unwrap_or(f64::NAN) * b)

@@ -1,7 +1,8 @@
-//! A [`Belief`] is one probability distribution over states per cell. Its constructors check or ensure this.
+//! A [`Belief`] consists of one probability distribution over states for each cell. Its constructors check or guarantee
+//! this.
 //!
 //! Estimators compute beliefs (the `u` and `p` of paper eqs. 5 and 6), and objectives read them. An exploring robot is
-//! attracted by their entropy (eq. 14).
+//! attracted to cells with high entropy (eq. 14).
 
 use emberwatch_model::Model;
 use emberwatch_model::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
@@ -9,11 +10,11 @@ use ndarray::{ArrayView2, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Maximum distance from 1 of the sum over a cell's probabilities. It is about 400 rounding errors of an `f32`: the
-/// error of a softmax or normalisation is smaller, and the error of a bug is larger.
+/// Maximum deviation from 1 of the sum of a cell's probabilities: about 400 times the rounding error of an `f32`. A
+/// softmax or normalisation deviates less, and a bug deviates more.
 const SUM_TOLERANCE: f32 = 5e-5;
 
-/// One distribution over states per cell, shape `[S, H, W]`; each cell sums to one.
+/// One distribution over states per cell, shape `[S, H, W]`. The probabilities of each cell sum to one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Probabilities", into = "Probabilities")]
 pub struct Belief {
@@ -25,20 +26,20 @@ pub struct Belief {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum EntropyKind {
-    /// Shannon's, in nats: `-sum_m p_m log p_m` (eq. 14), at most `log S`.
+    /// The Shannon entropy in nats, `-sum_m p_m log p_m` (eq. 14). It is at most `log S`.
     #[default]
     Sum,
     /// The mean over the S terms, as in the authors' code: `1/S` of [`EntropyKind::Sum`].
     Mean,
 }
 
-/// The reason why numbers are not a belief.
+/// The reason why an array is not a valid belief.
 #[derive(Debug, Error, PartialEq)]
 pub enum BeliefError {
-    /// The grid is refused by [`Shape`].
+    /// [`Shape`] rejects the size of the grid.
     #[error("belief: {0}")]
     Shape(#[from] ShapeError),
-    /// A cell's numbers are not a probability distribution.
+    /// A cell's values are not a probability distribution.
     #[error("belief of cell {cell}: expected probabilities >= 0 with sum 1, got {got:?}")]
     Simplex { cell: Cell, got: Vec<f32> },
     /// The model has no such state.
@@ -56,7 +57,7 @@ impl Belief {
         Self::everywhere(&vec![1.0 / n_states as f32; n_states], shape)
     }
 
-    /// Creates a belief with the model's initial distribution, at the start of burn-in, in every cell.
+    /// Creates a belief with the model's initial distribution in every cell: the distribution before burn-in.
     pub fn from_initial(model: &Model, shape: Shape) -> Self {
         let initial: Vec<f32> = model.initial().iter().map(|&p| p as f32).collect();
         Self::everywhere(&initial, shape)
@@ -132,10 +133,10 @@ impl Belief {
         numbers.flat_map(|p| p.to_le_bytes()).collect()
     }
 
-    /// Reads the bytes of [`Self::to_bytes`].
+    /// Creates a belief from the bytes of [`Self::to_bytes`].
     ///
-    /// Returns `None` if they do not encode a valid belief of shape `dim`, `[S, H, W]`. [`Self::from_probabilities`]
-    /// checks it.
+    /// Returns `None` if the bytes do not fit the shape `dim`, `[S, H, W]`, or if [`Self::from_probabilities`] rejects
+    /// the values.
     pub fn from_bytes(bytes: &[u8], dim: (usize, usize, usize)) -> Option<Self> {
         let (numbers, []) = bytes.as_chunks::<4>() else {
             return None;
@@ -194,13 +195,13 @@ impl Belief {
         slice.expect("invariant: beliefs are row-major")
     }
 
-    /// Like [`Self::as_slice`], for estimators. The caller must keep each cell on the simplex.
+    /// Returns a mutable slice of the probabilities for estimators, which must keep each cell on the simplex.
     pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
         let slice = self.probabilities.as_slice_mut();
         slice.expect("invariant: beliefs are row-major")
     }
 
-    /// Like [`Self::probabilities`], for estimators. The caller must keep each cell on the simplex.
+    /// Returns a mutable array of the probabilities for estimators, which must keep each cell on the simplex.
     pub(crate) fn probabilities_mut(&mut self) -> &mut Probabilities {
         &mut self.probabilities
     }
@@ -280,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn logarithm_agrees_with_the_library() {
+    fn logarithm_agrees_with_the_standard_library() {
         for i in 1..=2_000 {
             let p = i as f32 / 2_000.0;
             assert!((ln(p) - p.ln()).abs() < 2e-7 * p.ln().abs().max(1.0), "{p}");
@@ -292,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_off_the_simplex_are_rejected_by_cell() {
+    fn invalid_probabilities_are_rejected_with_their_cell() {
         let third = 1.0 / 3.0;
         // The last two sum to 1, but contain negative numbers.
         for states in [
@@ -319,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn the_initial_belief_is_the_models() {
+    fn the_initial_belief_is_the_initial_distribution() {
         let belief = Belief::from_initial(&Model::wildfire(), shape(3, 4));
         assert!(belief.probability(0).iter().all(|&p| p == 0.99));
         assert!(belief.probability(2).iter().all(|&p| p == 0.0));

@@ -1,9 +1,10 @@
-//! Correlations between the paying states of nearby cells, learned from frames.
+//! Correlations between nearby cells, learned from frames, with respect to the *paying state*: the state with the
+//! highest reward.
 //!
 //! There is one correlation for each pair of age ranges and each class of offsets. A cell's age is the number of steps
-//! since it was last seen, in `N_AGES` ranges. A class contains the offsets that differ only in direction. Learning
-//! needs no hidden states: if a frame shows two nearby cells, the product of their innovations estimates their
-//! covariance.
+//! since it was last seen. Ages are divided into `N_AGES` ranges. A class contains the offsets that differ only in
+//! direction. Learning needs no hidden states: if a frame shows two nearby cells, the product of their innovations
+//! estimates their covariance.
 
 use crate::estimation::belief::Belief;
 use crate::estimation::innovation::Innovation;
@@ -39,8 +40,8 @@ pub const AGE_RANGES: [usize; 256] = {
 /// Number of classes of offsets: one for each `(a, b)` with `a <= b <= RADIUS`. Class 0 is the cell itself.
 const N_CLASSES: usize = (RADIUS + 1) * (RADIUS + 2) / 2;
 
-/// Weight of the mean over all older age ranges, in pairs of cells with variance 1. Pairs of ranges with little data
-/// follow the mean.
+/// Weight of the mean over all older age ranges, as a number of cell pairs with variance 1. Pairs of age ranges with
+/// little data follow this mean.
 const SHRINKAGE: f64 = 60.0;
 
 /// Maximum correlation between two cells.
@@ -54,18 +55,20 @@ const MOST: f64 = 1e15;
 #[serde(try_from = "Sums", into = "Sums")]
 pub struct Correlations {
     sums: Sums,
-    /// The correlation by the age ranges of the two cells and the class of their offset.
+    /// The correlations, indexed by the age ranges of the two cells and the class of their offset.
     table: [[[f32; N_CLASSES]; N_AGES]; N_AGES],
 }
 
-/// The numerator and denominator of a correlation: the sum of products of innovations, and its value for correlation 1.
+/// The numerator and denominator of a correlation: the sum of products of innovations, and the value of this sum if the
+/// correlation were 1.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 struct Sum {
     products: f64,
     largest: f64,
 }
 
-/// The sums by the age ranges of the younger and the older cell and the class of their offset.
+/// The sums, indexed by the age range of the younger cell, the age range of the older cell, and the class of their
+/// offset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Sums([[[Sum; N_CLASSES]; N_AGES]; N_AGES]);
 
@@ -73,7 +76,7 @@ struct Sums([[[Sum; N_CLASSES]; N_AGES]; N_AGES]);
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ages(Vec<u8>);
 
-/// The evidence of a frame about one cell's paying state.
+/// The evidence that a frame provides about whether one cell is in the paying state.
 #[derive(Debug, Clone)]
 pub struct Evidence {
     cell: Cell,
@@ -92,7 +95,7 @@ impl Ages {
         Self(vec![u8::MAX; n_cells])
     }
 
-    /// Returns the steps since each cell was seen, row-major, saturating at 255.
+    /// Returns the number of steps since each cell was last seen, row-major, saturating at 255.
     pub fn as_slice(&self) -> &[u8] {
         &self.0
     }
@@ -111,11 +114,12 @@ impl Ages {
 }
 
 impl Evidence {
-    /// Computes the evidence of a frame about `state` at each of its cells. `belief` and `ages` are from before the
-    /// frame, and `likelihood` is `P(y | x)`, shape `[S, O]`. Omits observations that are impossible under the belief.
+    /// Computes the evidence about `state` for each cell that the frame shows. `belief` and `ages` are the values
+    /// before the frame, and `likelihood` is `P(y | x)`, shape `[S, O]`. Omits observations that are impossible under
+    /// the belief.
     ///
     /// # Panics
-    /// If the frame or the ages have another grid.
+    /// If the grid of the frame or of the ages differs from the belief's.
     pub fn of(
         frame: &Frame,
         belief: &Belief,
@@ -152,7 +156,7 @@ impl Sums {
 }
 
 impl Default for Correlations {
-    /// Returns the correlations before the first frame, with which cells are independent.
+    /// Returns the correlations before the first frame: all are zero, so that cells are independent.
     fn default() -> Self {
         let mut correlations = Self {
             sums: Sums([[[Sum::default(); N_CLASSES]; N_AGES]; N_AGES]),
@@ -190,13 +194,13 @@ impl From<Correlations> for Sums {
 }
 
 impl Correlations {
-    /// Returns the correlations of a cell in an age range, by the neighbour's age range and the [`class`] of the
-    /// offset.
+    /// Returns the correlations of a cell whose age is in range `age`. They are indexed by the neighbour's age range
+    /// and the [`class`] of the offset.
     pub fn of(&self, age: usize) -> &[[f32; N_CLASSES]; N_AGES] {
         &self.table[age]
     }
 
-    /// Creates correlations from a table by age ranges and offsets, shape `[N_AGES, N_AGES, SIDE, SIDE]`.
+    /// Creates correlations from a table of shape `[N_AGES, N_AGES, SIDE, SIDE]`, indexed by age ranges and offsets.
     #[cfg(test)]
     pub fn of_table(table: &ndarray::Array4<f32>) -> Self {
         let mut correlations = Self::default();

@@ -10,10 +10,10 @@ use std::borrow::Cow;
 use std::error::Error as StdError;
 use thiserror::Error;
 
-/// A belief about one world. In each step, [`Self::correct`] applies the frame, then [`Self::predict`] moves one step
-/// ahead.
+/// An estimator of one world's hidden states. In each step, [`Self::correct`] applies the frame, then [`Self::predict`]
+/// moves the belief one step ahead.
 ///
-/// Every estimator implements these two methods and [`Self::belief`]. The others are optional and have defaults.
+/// Every estimator implements these two methods and [`Self::belief`]. All other methods are optional and have defaults.
 pub trait Estimator: Send + Any {
     /// Corrects the belief with the frame of X_k (eq. 5).
     ///
@@ -24,8 +24,8 @@ pub trait Estimator: Send + Any {
     /// Moves the belief from X_k to X_{k+1} (eq. 6).
     fn predict(&mut self);
 
-    /// Returns a function that predicts several estimators, of any kind, with the same results as [`Self::predict`] on
-    /// each. Estimators that predict many worlds faster together provide it.
+    /// Returns a function that predicts several estimators together, with the same results as [`Self::predict`] on
+    /// each. The list may contain estimators of any kind. Returns `None` if predicting together is not faster.
     fn predict_together(&self) -> Option<fn(Vec<&mut dyn Estimator>)> {
         None
     }
@@ -33,19 +33,19 @@ pub trait Estimator: Send + Any {
     /// Returns the belief: about X_k after [`Self::correct`], about X_{k+1} after [`Self::predict`].
     fn belief(&self) -> &Belief;
 
-    /// Returns the approximate memory use of the estimator in bytes. The default is four times the size of its belief:
-    /// the belief, its predictor and work space.
+    /// Returns the approximate memory use of the estimator in bytes. The default is four times the size of the belief,
+    /// which accounts for the belief, its predictor and work space.
     fn memory_bytes(&self) -> usize {
         4 * size_of_val(self.belief().as_slice())
     }
 
-    /// Returns `P(y | x)`, shape `[S, O]`, if the belief predicts observations.
+    /// Returns `P(y | x)`, shape `[S, O]`, if observations can be predicted from the belief.
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         None
     }
 
-    /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by the filter that
-    /// this estimator corrects. Most estimators correct no filter.
+    /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by a base filter. Only
+    /// estimators that refine the predictions of another filter have one.
     fn base(&self) -> Option<&Probabilities> {
         None
     }
@@ -55,12 +55,12 @@ pub trait Estimator: Send + Any {
         None
     }
 
-    /// Returns the interface that saves the estimator's state, if another estimator can resume from it.
+    /// Returns the interface that saves the estimator's state, if the state can be saved.
     fn handover(&self) -> Option<&dyn Handover> {
         None
     }
 
-    /// Like [`Self::handover`], to restore a saved state.
+    /// Returns the interface that restores a saved state, if [`Self::handover`] can save it.
     fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
         None
     }
@@ -71,7 +71,8 @@ pub trait Estimator: Send + Any {
     }
 }
 
-/// An estimator whose state before X_{k+1} can be saved as bytes and restored by another of the same kind.
+/// An estimator whose state can be saved as bytes after the prediction of X_{k+1}, and restored by another estimator of
+/// the same kind.
 pub trait Handover {
     /// Returns a description of the byte format. Only estimators with the same description can read the bytes.
     fn kind(&self) -> String;
@@ -86,7 +87,8 @@ pub trait Handover {
 
 /// An oracle: an estimator that receives the hidden states.
 pub trait Told {
-    /// Receives hidden states, shape `[H, W]`: X_k after a frame, or X_{k+1} before a path if they are known.
+    /// Receives hidden states, shape `[H, W]`: X_k after a frame, or X_{k+1} before a path is planned, if they are
+    /// known.
     ///
     /// # Errors
     /// If the states do not fit the belief.

@@ -1,8 +1,8 @@
 //! The Bayes filter, for known and learned parameters (paper section III.A, in the masked form of section III.C).
 //!
-//! A frame turns the predictor `u_k` into the posterior `p_k` (eq. 5); the transition turns that into
-//! the next predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the
-//! frames, so this is an approximation even with the true model.
+//! A frame turns the predictor `u_k` into the posterior `p_k` (eq. 5); the transition turns that into the next
+//! predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the frames, so the filter is an
+//! approximation even with the true model.
 
 use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
@@ -20,22 +20,23 @@ use std::borrow::Cow;
 #[derive(Debug, Clone)]
 pub struct BayesFilter {
     transition: Transition,
-    /// Replaces the transition if the prediction is not the mean field.
+    /// Used instead of `transition`, unless the prediction is the mean field.
     prediction: Option<Prediction>,
     /// `P(y | x)`, shape `[S, O]`.
     likelihood: Array2<f64>,
     belief: Belief,
-    /// Buffer for the next predictor. With cavities, it also holds the belief before the next correction.
+    /// Buffer for the next predictor. With cavities, it also contains the belief before the next correction.
     predictor: Probabilities,
     /// Checksum of the parameters. A saved belief fits only a filter with the same parameters.
     checksum: u32,
 }
 
 impl BayesFilter {
-    /// Creates the filter of a known model, with `prior` as the predictor `u_0`. It predicts by the mean field.
+    /// Creates the filter of a known model, with `prior` as the predictor `u_0`. The filter predicts with the mean
+    /// field.
     ///
     /// # Errors
-    /// If eq. 3 could divide by zero on the prior's grid, or a map of the model has another grid.
+    /// If eq. 3 could divide by zero on the prior's grid, or a map of the model has a different grid.
     ///
     /// # Panics
     /// If the prior and the model have different numbers of states.
@@ -52,7 +53,8 @@ impl BayesFilter {
         Ok(Self::new(transition, likelihood, prior, checksum))
     }
 
-    /// Creates a filter with learned parameters, and `prior` as the predictor `u_0`. It predicts by the mean field.
+    /// Creates a filter with learned parameters, and `prior` as the predictor `u_0`. The filter predicts with the mean
+    /// field.
     ///
     /// # Panics
     /// If the prior and the parameters have different numbers of states.
@@ -95,7 +97,7 @@ impl BayesFilter {
         self
     }
 
-    /// Corrects the cavities after the belief was corrected.
+    /// Updates the cavities after a correction of the belief.
     pub(super) fn correct_cavities(&mut self) {
         if let Some(prediction) = &mut self.prediction {
             let before = self.predictor.as_slice().expect("invariant: row-major");
@@ -130,7 +132,7 @@ impl BayesFilter {
 
 impl Estimator for BayesFilter {
     /// # Panics
-    /// If the frame has another grid or more observations than the model.
+    /// If the frame's grid differs from the belief's, or the model lacks one of the frame's observations.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         correct(&mut self.belief, &self.likelihood, frame)?;
         self.correct_cavities();
@@ -142,7 +144,8 @@ impl Estimator for BayesFilter {
             let predictor = self.predictor.as_slice_mut();
             let predictor = predictor.expect("invariant: row-major");
             prediction.predict(self.belief.as_slice(), predictor);
-            // Both buffers hold the predictor, because the next correction of the cavities compares the belief with it.
+            // Both buffers contain the predictor, because the next correction of the cavities compares the belief with
+            // it.
             self.belief.as_mut_slice().copy_from_slice(predictor);
             return;
         }
@@ -253,7 +256,7 @@ mod tests {
     use emberwatch_model::grid::Shape;
 
     #[test]
-    fn two_parts_of_a_frame_correct_as_the_whole() {
+    fn correcting_in_two_parts_equals_one_correction() {
         let shape = Shape::new(3, 4).expect("test shape");
         let model = Model::built_in("wildfire-burnout").expect("built in");
         let filter = || {
@@ -297,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tiny_probability_is_evidence() {
+    fn a_tiny_probability_does_not_count_as_zero() {
         let shape = Shape::new(1, 1).expect("test shape");
         let numbers = [1.0, 0.0, f32::MIN_POSITIVE];
         let numbers = Probabilities::from_shape_fn((3, 1, 1), |(state, _, _)| numbers[state]);

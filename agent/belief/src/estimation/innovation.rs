@@ -2,7 +2,7 @@
 
 use ndarray::Array2;
 
-/// Lower bound of variances that serve as a denominator.
+/// Lower bound on variances that are used as denominators.
 const LEAST_VARIANCE: f64 = 1e-9;
 
 /// The effect of an observation on the probability of one state of the observed cell.
@@ -19,8 +19,8 @@ pub struct Innovation {
 }
 
 impl Innovation {
-    /// Computes the effect of an observation on `state` by Bayes' rule (eq. 5). `prior` has the cell's probabilities,
-    /// and `likelihood` is `P(y | x)`, shape `[S, O]`. Returns `None` if the observation is impossible.
+    /// Computes the effect of an observation on `state` by Bayes' rule (eq. 5). `prior` contains the cell's
+    /// probabilities, and `likelihood` is `P(y | x)`, shape `[S, O]`. Returns `None` if the observation is impossible.
     pub fn of(prior: &[f64], likelihood: &Array2<f64>, state: usize, observed: u8) -> Option<Self> {
         let (n_observations, before) = (likelihood.ncols(), prior[state]);
         let likelihood = likelihood.as_slice();
@@ -34,7 +34,8 @@ impl Innovation {
             _ => 0.0,
         };
         let seen = usize::from(observed);
-        // A sensor with several matrices has them side by side. Average over the one that made this observation.
+        // If a sensor has several matrices, they are stored side by side. Average over the matrix to which this
+        // observation belongs.
         let n_matrices = own[..n_observations].iter().sum::<f64>().round().max(1.0) as usize;
         let of_matrix = n_observations / n_matrices;
         let matrix = seen / of_matrix * of_matrix..(seen / of_matrix + 1) * of_matrix;

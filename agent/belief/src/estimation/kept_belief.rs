@@ -1,5 +1,5 @@
-//! A cache of simulated priors in the user's cache folder. Each file holds a key, the probabilities and a checksum. If
-//! a file or the folder is unusable, the caller simulates the prior again.
+//! A cache of simulated priors in the user's cache folder. Each file contains a key, the probabilities and a checksum.
+//! If a file or the folder is unusable, the caller simulates the prior again.
 
 use crate::estimation::belief::Belief;
 use crate::estimation::prior::Prior;
@@ -101,7 +101,8 @@ fn cache_folder() -> Option<PathBuf> {
         .or_else(|| of_home().filter(is_absolute))
 }
 
-/// Writes a user-only temporary file next to the path and renames it. Its checksum reveals files cut short by a crash.
+/// Writes a user-only temporary file next to the path and renames it. The checksum in `bytes` reveals files cut short
+/// by a crash.
 fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let temporary = path.with_extension(std::process::id().to_string());
     // A file left by an earlier process with the same id may have other permissions.
@@ -115,7 +116,7 @@ fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
         .and_then(|mut file| file.write_all(bytes))
         .and_then(|()| std::fs::rename(&temporary, path));
     if written.is_err() {
-        // Report the first error, not an error of the cleanup.
+        // Report the first error, not an error during cleanup.
         let _ = std::fs::remove_file(&temporary);
     }
     written
@@ -144,7 +145,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_belief_of_the_most_bytes_is_kept_and_none_above() {
+    fn only_beliefs_up_to_the_maximum_size_are_cached() {
         // This model has four states.
         let model = Model::built_in("road-ice").expect("built in");
         let is_kept = |width| {
@@ -156,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_belief_is_kept_for_all_that_it_depends_on() {
+    fn every_input_of_a_belief_changes_its_file_name() {
         let kept = |seed, n_worlds, (height, width)| {
             let shape = Shape::new(height, width).expect("test shape");
             let burn_in = 40;
@@ -177,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_is_read_and_anything_else_is_not() {
+    fn only_intact_files_with_the_same_key_are_read() {
         let folder = tempfile::TempDir::new().expect("a folder");
         let kept = |key: &str| KeptBelief {
             path: folder.path().join("new/a.belief"),
@@ -185,7 +186,7 @@ mod tests {
             dim: (3, 1, 2),
         };
         let belief = Belief::uniform(3, Shape::new(1, 2).expect("test shape"));
-        assert_eq!(kept("key").read(), None, "not there");
+        assert_eq!(kept("key").read(), None, "no file yet");
         kept("key").write(&belief).expect("written");
         assert_eq!(kept("key").read(), Some(belief.clone()));
         assert_eq!(kept("kez").read(), None, "a different key");
@@ -204,11 +205,11 @@ mod tests {
             .write(&belief)
             .expect_err("a folder in its place");
         let left = std::fs::read_dir(folder.path().join("new"));
-        assert_eq!(left.expect("listed").count(), 1, "the folder alone");
+        assert_eq!(left.expect("listed").count(), 1, "only the folder");
     }
 
     #[test]
-    fn the_oldest_files_go() {
+    fn the_oldest_files_are_removed() {
         let folder = tempfile::TempDir::new().expect("a folder");
         for (name, seconds) in [("a", 20), ("b", 10), ("c", 30)] {
             let file = std::fs::File::create(folder.path().join(name)).expect("a file");

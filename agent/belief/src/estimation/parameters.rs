@@ -1,9 +1,9 @@
-//! The parameters of a learned filter, as unconstrained numbers: weights `w >= 0`, rows of `O`, and the first belief
-//! `u_0`.
+//! The parameters of a learned filter, stored as unconstrained values: weights `w >= 0`, the observation probabilities
+//! `P(y | x)`, and the initial belief `u_0`.
 //!
-//! `w` is the softplus of the first tensor. Each row of `P(y | x)` and the first belief are softmaxes of the others.
-//! All unconstrained numbers are clamped to ±[`BOUND`]. So no weight or probability vanishes, and eqs. 3 and 5 never
-//! divide by zero.
+//! `w` is the softplus of the first tensor. Each row of `P(y | x)` is the softmax of a row of the second tensor, and
+//! `u_0` is the softmax of the third. Unconstrained values are clamped to ±[`BOUND`], so that no weight or probability
+//! is zero and eqs. 3 and 5 never divide by zero.
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::randomness::split_mix;
@@ -12,17 +12,18 @@ use ndarray::{Array2, Array4};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Maximum size of an unconstrained number. Weights are at least 1e-7, probabilities at least 1e-14.
+/// Maximum magnitude of an unconstrained value. With it, weights are at least 1e-7 and probabilities at least 1e-14.
 pub const BOUND: f32 = 16.0;
 
-/// Initial weight of a cell's own state for keeping it. The initial weights suit states that persist and spread.
+/// Initial weight of a transition in which a cell keeps its state. The initial weights suit states that persist and
+/// spread.
 const OWN_WEIGHT: f64 = 1.0;
-/// Initial weight of a neighbour's state for spreading to the cell.
+/// Initial weight of a transition in which a cell adopts a neighbour's state.
 const NEIGHBOUR_WEIGHT: f64 = 0.1;
-/// Initial weight of each other next state, as a share of the two weights above.
+/// Initial weight of all other transitions, as a fraction of the two weights above.
 const OTHER_STATE: f64 = 0.005;
 
-/// Initial logit of observing a state as itself. With three observations, its probability is 0.86.
+/// Initial logit of observing a state as itself. With three observations, the probability of doing so is 0.86.
 const OWN_OBSERVATION: f32 = 2.5;
 
 /// Amplitude of the noise on the initial logits, and of the relative noise on the initial weights. Without noise,
@@ -34,17 +35,18 @@ const NOISE: f32 = 0.1;
 pub struct Dimensions {
     pub n_states: usize,
     pub n_observations: usize,
-    /// Number of rows and columns of the kernel, both odd.
+    /// Number of rows and number of columns of the kernel, both odd.
     pub kernel: (usize, usize),
-    /// Whether there is one kernel per own state of the cell. A checkpoint stores it as the shape of a tensor.
+    /// Whether there is a separate kernel for each current state of the cell, its *own state*. A checkpoint stores this
+    /// setting as the shape of a tensor.
     #[serde(skip)]
     pub sees_own_state: bool,
-    /// Number of the sensor's observation matrices M, at least 1. A checkpoint stores it as the shape of a tensor.
+    /// Number M of observation matrices of the sensor, at least 1. A checkpoint stores it as the shape of a tensor.
     #[serde(skip, default = "one")]
     pub n_matrices: usize,
 }
 
-/// Three tensors in the order of [`Parameters::NAMES`]: unconstrained numbers, or their gradients or moments.
+/// Three tensors in the order of [`Parameters::NAMES`]: unconstrained values, their gradients, or their Adam moments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
@@ -53,12 +55,12 @@ pub struct Parameters {
     pub tensors: [Vec<f32>; 3],
 }
 
-/// The weights and probabilities that [`Parameters`] stand for.
+/// The weights and probabilities that [`Parameters`] encode.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables {
     pub dimensions: Dimensions,
-    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`. With own-state kernels, the centre only counts where
-    /// `from` is `own`.
+    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`. With own-state kernels, centre weights apply only if
+    /// `from` equals `own`.
     pub kernel: Vec<f32>,
     /// `P(y | x)`, shape `[S, O]`.
     pub likelihood: Vec<f32>,
@@ -66,7 +68,7 @@ pub struct Tables {
     pub initial: Vec<f32>,
 }
 
-/// The reason why dimensions are out of range.
+/// An error about dimensions that are out of range.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum DimensionsError {
@@ -153,8 +155,8 @@ impl Parameters {
 
     /// Returns the initial parameters for learning.
     ///
-    /// With them, states persist, spread to neighbours, and mostly show the observation with their own number, if it
-    /// exists. All own-state kernels start equal, up to noise.
+    /// With these parameters, states persist and spread to neighbours. Each state is mostly observed as the value with
+    /// the same index, if that value exists. All own-state kernels start equal, except for noise.
     pub fn first(dimensions: Dimensions, seed: u64) -> Self {
         let [n_kernel, n_likelihood, n_initial] = dimensions.lengths();
         // Uniform in -1..1.
@@ -230,14 +232,14 @@ impl Parameters {
         }
     }
 
-    /// Returns the name of the first tensor with an infinite number or NaN.
+    /// Returns the name of the first tensor that contains an infinite value or NaN.
     pub fn not_finite(&self) -> Option<&'static str> {
         let tensors = Self::NAMES.into_iter().zip(&self.tensors);
         let wrong = |(_, numbers): &(&str, &Vec<f32>)| !numbers.iter().all(|x| x.is_finite());
         tensors.into_iter().find(wrong).map(|(name, _)| name)
     }
 
-    /// Clamps all numbers to ±[`BOUND`].
+    /// Clamps all values to ±[`BOUND`].
     pub fn bound(&mut self) {
         for number in self.tensors.iter_mut().flatten() {
             *number = number.clamp(-BOUND, BOUND);
@@ -251,10 +253,10 @@ impl Tables {
         Belief::everywhere(&self.initial, shape)
     }
 
-    /// Returns the tables of a known model, which are the goal of learning.
+    /// Returns the tables of a known model, which are the target of learning.
     ///
-    /// The tables omit the bias. Beliefs sum to one, so away from the edges a bias equals weights that are the same for
-    /// all states.
+    /// The tables omit the bias. Beliefs sum to one, so away from the edges a bias has the same effect as a weight that
+    /// is equal for all states.
     ///
     /// # Panics
     /// If the model has several zones.

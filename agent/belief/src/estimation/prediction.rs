@@ -1,5 +1,5 @@
-//! Predictions that are more accurate than the mean field of eqs. 2 and 3. The beliefs stay distributions of single
-//! cells.
+//! Predictions that are more accurate than the mean field of eqs. 2 and 3. A belief still consists of one distribution
+//! per cell.
 //!
 //! Eq. 2 gives the weight of each next state `m` of a cell: `N[m] = b[m] + sum_k w[m, x_k, k]`. Here `b[m]` is a bias
 //! and `x_k` is the state of neighbour `k`. Eq. 3 divides the weights by their total `D = sum_m N[m]`. The states of
@@ -21,12 +21,12 @@
 //! neighbour's state, `D` is certain. The mean field is then exact and is computed instead.
 //!
 //! **Echo.** A cell changes its neighbours, and the changed beliefs about them change the cell's next prediction, as if
-//! they were new evidence. Dynamic message passing (Karrer and Newman 2010; Lokhov et al. 2014) avoids this. It keeps
-//! a *cavity* for each cell and each of its neighbours: the belief about the cell, given that the neighbour stays in
-//! its *susceptible* state. That is the own state in which a cell's neighbours influence its next state. A
-//! susceptible cell is predicted from its neighbours' cavities, which do not contain its own influence. Cavities need
-//! kernels that depend on the own state. If several own states depend on neighbours, the most influenced one counts
-//! as susceptible.
+//! they were new evidence. Dynamic message passing (Karrer and Newman 2010; Lokhov et al. 2014) avoids this. It keeps a
+//! *cavity* for each cell and each of its neighbours: the belief about the cell, given that the neighbour stays
+//! susceptible. A cell is *susceptible* in the state in which its neighbours influence its next state. A susceptible
+//! cell is predicted from its neighbours' cavities, which do not contain its own influence. Cavities need own-state
+//! kernels: one kernel for each current state of the cell. If neighbours influence several of these states, the most
+//! influenced one is treated as susceptible.
 
 mod chunk;
 mod kernels;
@@ -53,7 +53,7 @@ pub enum PredictionKind {
     MeanField,
     /// The mean of the ratio in eq. 3, to second order.
     SecondOrder,
-    /// The second order, computed from the neighbours' cavities.
+    /// The second-order prediction, computed from the neighbours' cavities.
     Cavities,
 }
 
@@ -74,7 +74,7 @@ fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
     }
 }
 
-/// Predicts the belief of one world, and keeps its cavities.
+/// The predictor of one world's belief, with its cavities.
 #[derive(Debug, Clone)]
 pub struct Prediction {
     shape: Shape,
@@ -83,12 +83,12 @@ pub struct Prediction {
     layout: Layout,
     /// Index of the susceptible state's kernel, if there are cavities.
     susceptible: Option<usize>,
-    /// For each neighbour, the offset of its index in a plane from the cell's index.
+    /// For each neighbour, the difference between its index and the cell's index in a plane.
     offsets: Vec<isize>,
     beliefs: PaddedBeliefs,
     /// Buffer for the cavities after the next prediction.
     next: PaddedBeliefs,
-    /// For each neighbour, the index of its belief, for the current chunk and kernel.
+    /// For each neighbour, the index of its belief in the planes, for the current chunk and kernel.
     places: Vec<usize>,
     predictor: ChunkPredictor,
 }
@@ -96,7 +96,8 @@ pub struct Prediction {
 impl Prediction {
     /// Prepares predictions on the belief's grid. All cavities start as the given belief.
     ///
-    /// Without own-state kernels, [`PredictionKind::Cavities`] has no cavities and computes the second order.
+    /// Without own-state kernels, [`PredictionKind::Cavities`] has no cavities and computes the second-order
+    /// prediction.
     ///
     /// # Panics
     /// If the belief and the weights have different numbers of states.
@@ -135,7 +136,7 @@ impl Prediction {
 
     /// Returns the approximate memory use in bytes.
     pub fn memory_bytes(&self) -> usize {
-        // The factor 2 counts a second set of beliefs and work space of the size of the weights.
+        // The factor 2 accounts for a second set of beliefs, and for work space as large as the weights.
         let n_weights = self.n_states * self.n_states * (1 + self.offsets.len());
         let beliefs = size_of_val(&*self.beliefs.probabilities);
         2 * (beliefs + n_weights * size_of::<Lanes>()) + self.layout.slots.memory_bytes()
@@ -159,7 +160,7 @@ impl Prediction {
 
     /// Loads the cavities from the bytes of a prediction with the same weights, kind and grid.
     ///
-    /// Returns false and changes nothing if the length differs, or if [`Belief::from_bytes`] refuses a cavity.
+    /// Returns false and changes nothing if the length differs, or if [`Belief::from_bytes`] rejects a cavity.
     pub fn restore(&mut self, bytes: &[u8]) -> bool {
         self.beliefs.restore_cavities(bytes)
     }
@@ -171,10 +172,10 @@ impl Prediction {
         }
     }
 
-    /// Computes the predictor of a posterior, both `[S, H, W]`, and predicts the cavities.
+    /// Computes the predictor from a posterior, both `[S, H, W]`, and predicts the cavities.
     ///
     /// # Panics
-    /// If either slice has another length.
+    /// If either slice has a different length.
     pub fn predict(&mut self, posterior: &[f32], predictor: &mut [f32]) {
         let expected = self.n_states * self.shape.n_cells();
         assert_eq!(posterior.len(), expected, "posterior: expected [S, H, W]");
@@ -239,8 +240,8 @@ impl Prediction {
             let has_cavities = self.susceptible == Some(index);
             let neighbours = self.places.iter_mut().zip(&self.offsets).enumerate();
             for (neighbour, (to, offset)) in neighbours {
-                // Use the cavity without this cell's influence. From the neighbour, this cell is in the opposite
-                // direction.
+                // Use the neighbour's cavity that excludes this cell's influence. As seen from the neighbour, this cell
+                // lies in the opposite direction.
                 let opposite = n - 1 - neighbour;
                 let belief = if has_cavities {
                     opposite
@@ -261,8 +262,8 @@ impl Prediction {
         }
     }
 
-    /// Returns the probability of a next state, as the mean over own states. The belief about the own states starts at
-    /// `at`. Without a `cavity`, it is the probability of the belief itself.
+    /// Returns the probability of a next state, averaged over the cell's current states. The belief about the current
+    /// state starts at index `at`. It is one of the cavities if `cavity` is given.
     #[inline(always)]
     fn next_probability(
         &self,

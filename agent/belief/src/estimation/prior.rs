@@ -10,23 +10,23 @@ use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Weight of the grid-wide average in a cell's prior, in worlds. The choice hardly matters, because the first frames
-/// soon outweigh it.
+/// Weight of the grid-wide average in a cell's prior, as a number of worlds. The value hardly matters, because the
+/// first frames soon outweigh the prior.
 const POOLED_WORLDS: f64 = 16.0;
 
-/// A choice of the belief before the first frame.
+/// A kind of belief before the first frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Prior {
-    /// The frequency of each state in each cell of simulated worlds after burn-in. Nothing better can be known before
+    /// The frequency of each state in each cell of simulated worlds after burn-in. No better belief is possible before
     /// the first frame.
     Simulated {
         n_worlds: usize,
         /// Number of steps from the initial distribution.
         burn_in: u64,
     },
-    /// The model's initial distribution, which is right for a world without burn-in.
+    /// The model's initial distribution, which is exact for a world without burn-in.
     Initial,
-    /// Every state equally likely, as in the authors' demonstration.
+    /// The same probability for every state, as in the authors' demonstration.
     Uniform,
 }
 
@@ -43,7 +43,8 @@ impl Prior {
         Ok(belief.expect("invariant: nothing cancels it"))
     }
 
-    /// Like [`Self::belief`], but returns `None` soon after `cancelled` is set. A simulation may take minutes.
+    /// Returns the belief as [`Self::belief`] does, or `None` soon after `cancelled` is set. A simulation can take
+    /// minutes.
     pub fn belief_unless(
         self,
         cancelled: &AtomicBool,
@@ -114,8 +115,8 @@ impl Simulation<'_> {
 
 /// Computes relative frequencies per cell, shrunk towards the frequencies of the whole grid.
 ///
-/// The grid-wide frequencies count like [`POOLED_WORLDS`] more worlds: a few worlds say little about one cell, and a
-/// state that none of them shows in a cell is still possible there.
+/// The grid-wide frequencies count as [`POOLED_WORLDS`] additional worlds. A few worlds say little about one cell, and
+/// a state that never occurred in a cell is still possible there.
 fn average(counts: &Array3<u32>, n_states: usize, shape: Shape) -> Belief {
     let in_all = |state: usize| -> u32 { counts.index_axis(Axis(0), state).sum() };
     let totals: Vec<f64> = (0..n_states)
@@ -160,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn a_simulation_that_is_cancelled_ends_without_a_belief() {
+    fn a_cancelled_simulation_returns_no_belief() {
         let shape = Shape::new(9, 12).expect("test shape");
         let endless = simulated(3, u64::MAX);
         let cancelled = AtomicBool::new(true);

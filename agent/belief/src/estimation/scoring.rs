@@ -27,8 +27,8 @@ impl AddAssign for Score {
     }
 }
 
-/// Scores a frame under the predictor `u`: the sum over its observed cells of `ln sum_x P(y | x) u(x)`, as if cells
-/// were independent. `likelihood` is `P(y | x)`, shape `[S, O]`.
+/// Scores a frame under the predictor `u`: the sum of `ln sum_x P(y | x) u(x)` over its observed cells, which are
+/// treated as independent. `likelihood` is `P(y | x)`, shape `[S, O]`.
 pub fn score(predictor: &Belief, likelihood: &Array2<f64>, frame: &Frame) -> Score {
     let n_cells = predictor.shape().n_cells();
     let numbers = predictor.as_slice();
@@ -49,7 +49,7 @@ mod tests {
     use emberwatch_model::{Model, Shape};
 
     #[test]
-    fn a_score_is_the_logarithm_of_the_probability_of_what_was_seen() {
+    fn a_score_sums_the_log_probabilities_of_observations() {
         let shape = Shape::new(1, 3).expect("test shape");
         let frame = Frame::from_bytes(shape, 3, &[2, 255, 0]).expect("test frame");
         let belief = Belief::uniform(3, shape);

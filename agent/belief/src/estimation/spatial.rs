@@ -1,9 +1,9 @@
 //! A Bayes filter whose corrections reach the neighbours of visited cells.
 //!
-//! The filter of eqs. 5 and 6 assumes that cells are independent given the frames, and corrects visited cells only.
-//! But states are strongly correlated in space. This filter spreads the innovation of each visited cell to its
-//! neighbourhood by optimal interpolation (Gandin 1963), with learned [`Correlations`]. The prediction stays eq. 6,
-//! and no covariance is kept between steps.
+//! The filter of eqs. 5 and 6 assumes that cells are independent given the frames, and corrects visited cells only. But
+//! states are strongly correlated in space. This filter spreads the innovation of each visited cell to its
+//! neighbourhood by optimal interpolation (Gandin 1963), with learned [`Correlations`]. The prediction is still eq. 6,
+//! and no covariances are kept between steps.
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::Belief;
@@ -17,7 +17,7 @@ use emberwatch_model::Frame;
 use ndarray::Array2;
 use std::borrow::Cow;
 
-/// Encoding of ages and correlations. The limit exceeds the encoded size for the largest grid.
+/// Encoding of ages and correlations. The size limit is above the encoded size for the largest grid.
 const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::config::standard()
     .with_fixed_int_encoding()
     .with_limit();
@@ -26,7 +26,7 @@ const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::c
 #[derive(Debug, Clone)]
 pub struct SpatialFilter {
     filter: BayesFilter,
-    /// The state whose probability is spread.
+    /// The state whose probability corrections spread to neighbours.
     state: usize,
     correlations: Correlations,
     ages: Ages,
@@ -53,7 +53,7 @@ impl SpatialFilter {
 
     /// Wraps a filter. Corrections spread the probability of `state`, the *paying state* with the highest reward.
     ///
-    /// Each frame updates `correlations`. The default has none yet.
+    /// Each frame updates `correlations`. The default correlations are zero.
     ///
     /// # Panics
     /// If the filter has no such state.
@@ -79,7 +79,7 @@ impl SpatialFilter {
         self.correlations = correlations;
     }
 
-    /// Corrects the belief with observations of distinct cells, one after the other. Each item of `seen` is a cell's
+    /// Corrects the belief with observations of distinct cells, in the given order. Each item of `seen` is a cell's
     /// row-major index and its observation.
     ///
     /// # Errors
@@ -112,7 +112,7 @@ impl SpatialFilter {
 
 impl Estimator for SpatialFilter {
     /// # Panics
-    /// If the frame has another grid.
+    /// If the frame's grid differs from the belief's.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         let (dim, expected) = (frame.values().dim(), self.belief().shape().dim());
         assert_eq!(dim, expected, "frame: expected the belief's grid");

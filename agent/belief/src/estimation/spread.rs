@@ -6,8 +6,8 @@ use crate::estimation::innovation::Innovation;
 use emberwatch_model::vectors::vectorised;
 use emberwatch_model::{Cell, Shape};
 
-/// Bound on spread probabilities. An observation of a neighbour is never conclusive, so it leaves the paying state with
-/// a probability from `LEAST` to `1 - LEAST`.
+/// Bound on spread probabilities. An observation of a neighbour is never conclusive, so it keeps the probability of the
+/// paying state between `LEAST` and `1 - LEAST`.
 const LEAST: f32 = 1e-5;
 
 /// Index of the seen cell in its own patch.
@@ -32,12 +32,12 @@ const WIDTH: usize = SIDE + 2 * RADIUS;
 /// patches of two nearby cells by a single offset.
 type Patch = [f32; WIDTH * SIDE];
 
-/// Work space of a correction. Per-cell buffers are row-major, with a margin of [`RADIUS`] cells around the grid whose
-/// covariance with any cell is 0.
+/// Work space of a correction. Per-cell buffers are row-major, with a margin of [`RADIUS`] cells around the grid. The
+/// covariance of a margin cell with any cell is 0.
 #[derive(Debug, Clone)]
 pub struct Spread {
     shape: Shape,
-    /// The state whose probability is spread.
+    /// The state whose probability corrections spread to neighbours.
     state: usize,
     /// Length of a row with its margins.
     stride: usize,
@@ -137,13 +137,14 @@ impl Spread {
         self.seen.len()
     }
 
-    /// Returns a seen cell, its observation, and the belief about it after the corrections so far.
+    /// Returns a seen cell, its observation, and the belief about the cell after the corrections so far.
     pub fn prior(&self, index: usize, belief: &Belief) -> (Cell, u8, Vec<f64>) {
         let SeenCell { cell, observed, .. } = self.seen[index];
         let now = f64::from(self.probability[self.place(cell)]);
         let mut states = belief.states(self.shape.index(cell));
         let rest: f64 = states.iter().sum::<f64>() - states[self.state];
-        // If no neighbour changed the probability, keep all states: `1 - now` may lose a tiny rest to rounding.
+        // If no neighbour changed the probability, keep all probabilities: computing `1 - now` could lose a tiny
+        // remainder to rounding.
         if rest > 0.0 && now != states[self.state] {
             states.iter_mut().for_each(|p| *p *= (1.0 - now) / rest);
             states[self.state] = now;
@@ -151,7 +152,7 @@ impl Spread {
         (cell, observed, states)
     }
 
-    /// Corrects a seen cell, its neighbours, and the covariances of the seen cells after it.
+    /// Corrects a seen cell, its neighbours, and the covariances of the seen cells that are corrected later.
     pub fn spread(&mut self, index: usize, innovation: &Innovation, posterior: Vec<f64>) {
         let own = posterior[self.state] as f32;
         vectorised(
@@ -237,7 +238,7 @@ impl Spread {
 
 /// Sets the probability of one state to `now`, and rescales the other states in proportion.
 ///
-/// The cells are the first `now.len()` of each state's `n_cells`. A cell whose other states all have probability 0 is
+/// The updated cells are the first `now.len()` cells of each state. A cell whose other states all have probability 0 is
 /// left unchanged.
 #[inline(always)]
 fn set_state(numbers: &mut [f32], n_cells: usize, state: usize, now: &[f32]) {

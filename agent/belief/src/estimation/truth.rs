@@ -13,14 +13,14 @@ pub struct Oracle {
     transition: Transition,
 }
 
-/// An oracle that receives X_{k+1}, the states that the next path will meet.
+/// An oracle that receives X_{k+1}, the states that the next path will observe.
 pub struct Clairvoyant(pub Belief);
 
 /// A constant belief, as if nothing were ever observed.
 pub struct Unchanging(pub Belief);
 
 impl Oracle {
-    /// Creates an oracle that holds `prior` until it receives hidden states.
+    /// Creates an oracle whose belief is `prior` until it receives hidden states.
     ///
     /// # Errors
     /// If the model cannot be simulated on the prior's grid.

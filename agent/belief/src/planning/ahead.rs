@@ -1,5 +1,5 @@
-//! Beam search over several consecutive paths. The robot flies only the first. It heads for cells that a single path
-//! cannot reach. If the other paths find nothing either, it heads for the nearest valuable cells.
+//! Beam search over several consecutive paths. The robot flies only the first path, but can thus head for cells that a
+//! single path cannot reach. If no planned path reaches a valuable cell, the robot heads for the nearest one.
 
 use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
@@ -9,7 +9,7 @@ use emberwatch_model::{Cell, Grid};
 /// Number of paths per plan. With T = 12 moves each, they reach most cells of a 64 x 64 grid.
 const N_PATHS: usize = 6;
 
-/// Discount from each path to the next, because cells may have burnt out when a later path arrives.
+/// Discount from each path to the next, because cells may have burnt out by the time a later path reaches them.
 const DISCOUNT: f32 = 0.8;
 
 /// A planner that plans six consecutive paths and returns the first.
@@ -45,13 +45,14 @@ impl Planner for Ahead {
     }
 }
 
-/// Computes the maximum discounted value of all cells as seen from each cell, shape `[H, W]`. Each move on the way to a
-/// cell multiplies its value by `kept_per_move`. This gives the search a direction where the values are flat.
+/// Computes for each cell the maximum of all cells' values, discounted by their distance, shape `[H, W]`. Each move on
+/// the way to a cell multiplies its value by `kept_per_move`. This guides the search in regions where all values are
+/// equal.
 fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
     let mut promise = values.worth().mapv(|value| value.max(0.0));
     let airspace = values.airspace();
     let is_free = |(row, col): (usize, usize)| airspace.is_free(Cell { row, col });
-    // No-fly cells have no value, and no way leads through them.
+    // No-fly cells have no value, and no path leads through them.
     let all = promise.indexed_iter_mut();
     all.filter(|(at, _)| !is_free(*at))
         .for_each(|(_, promise)| *promise = 0.0);
@@ -63,7 +64,7 @@ fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
             promise[[row, col]] = promise[[row, col]].max(passed_on);
         }
     };
-    // One pass down and to the right, then one pass back. On an open grid, this covers all ways.
+    // One pass down and to the right, then one pass back. On an open grid, this covers all shortest paths.
     for (row, col) in cells.clone() {
         spread(
             (row, col),
@@ -81,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_promise_fades_with_the_way_to_it() {
+    fn a_promise_fades_with_distance() {
         let best = [((2, 1), 1.0_f32), ((6, 7), 0.9)];
         let mut value = Grid::zeros((8, 9));
         best.iter().for_each(|&(at, worth)| value[at] = worth);
@@ -96,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_plan_reaches_gives_its_direction() {
+    fn values_out_of_reach_still_attract_the_robot() {
         let mut value = Grid::zeros((64, 64));
         value[(60, 5)] = 1.0;
         let values = CellValues::new(value, BEAM_BONUS);

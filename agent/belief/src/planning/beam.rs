@@ -2,8 +2,8 @@
 //!
 //! The planner of paper section III.D draws paths at random. But the objective of eq. 15 over distinct cells is an
 //! orienteering problem, for which extending only good partial paths finds far better paths in less time. A state of
-//! the search is a cell and the set of cells visited so far, in any order. Of the partial paths with the same state,
-//! the search keeps the best.
+//! the search consists of the robot's cell and the set of cells visited so far. Of the partial paths with the same
+//! state, the search keeps the best.
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use crate::planning::reach::Reach;
@@ -16,8 +16,8 @@ const HASH_KEY: u64 = 0x6265_616d;
 /// The default width.
 ///
 /// With the known-model filter, width 100 earned 37.2 +- 2.2 per step on 40 training worlds of 300 steps. Widths 50 and
-/// 200 earned .5 +- .9 and .5 +- .8 less (paired), in 0.4 and 2 times the time. A greedy walk earned 8.1 +- .8 less (16
-/// worlds).
+/// 200 earned .5 +- .9 and .5 +- .8 less (paired differences), and took 0.4 and 2 times as long. A greedy walk earned
+/// 8.1 +- .8 less (16 worlds).
 pub const DEFAULT_WIDTH: usize = 50;
 
 /// Beam search of a given width. A hash of the visited cells breaks ties, so that no direction is preferred.
@@ -30,22 +30,23 @@ pub struct BeamSearch {
     /// Weight of the next move's cell: a power of the discount.
     weight: f32,
     reach: Reach,
-    /// A random number for each cell of the reach (Zobrist, 1970). The hash of a set is their exclusive or, which does
-    /// not depend on the order of the visits.
+    /// A random number for each cell of the reach (Zobrist, 1970). The hash of a set of cells is the exclusive or of
+    /// their random numbers, so it does not depend on the order of visits.
     cell_hashes: Vec<u64>,
     beam: Vec<State>,
     next_beam: Vec<State>,
     /// For each state of the beam, one bit per cell of the reach: whether the path has visited it.
     visited: Vec<u64>,
     next_visited: Vec<u64>,
-    /// The same for the cells seen by the path, if cells in sight count.
+    /// If cells in sight count: for each state of the beam, one bit per cell in sight of the reach, set if the path has
+    /// seen the cell.
     seen_cells: Vec<u64>,
     next_seen_cells: Vec<u64>,
     candidates: Vec<Candidate>,
     /// The rank and the index of each candidate.
     ranking: Vec<(u64, u32)>,
     seen: SeenStates,
-    /// For each move, the origin of each state of the beam after it.
+    /// For each move, the origins of the states in the beam after that move.
     history: Vec<Origin>,
 }
 
@@ -115,13 +116,14 @@ impl BeamSearch {
         self.cell_hashes.clear();
     }
 
-    /// Sets the discount: a cell counts `discount` times as much as at the previous move. The default is 1.
+    /// Sets the discount: the cell of each move counts `discount` times as much as that of the previous move. The
+    /// default is 1.
     pub fn set_discount(&mut self, discount: f32) {
         self.discount = discount;
     }
 
-    /// Like [`Planner::plan`], but returns `None` as soon as `stops` returns true. It is called before each move,
-    /// because the search with a wide beam may take minutes.
+    /// Plans as [`Planner::plan`] does, but returns `None` as soon as `stops` returns true. `stops` is called before
+    /// each move, because a search with a wide beam can take minutes.
     pub fn plan_unless(
         &mut self,
         problem: &PlanningProblem<'_>,
@@ -227,7 +229,7 @@ impl BeamSearch {
         }
     }
 
-    /// Returns the successor of a state of the beam by a move, and the hash of its cell and visited set.
+    /// Returns the successor of a state of the beam after a move, and the hash of the successor's cell and visited set.
     #[inline]
     fn successor(&self, index: usize, step: Move) -> (Candidate, u64) {
         let before = self.beam[index];
@@ -322,15 +324,15 @@ impl Planner for BeamSearch {
     }
 }
 
-/// Returns bits whose unsigned order is the order of the numbers.
+/// Returns bits that sort as unsigned integers in the same order as the scores.
 fn ordered_bits(score: f32) -> u32 {
     let bits = score.to_bits();
     // As bits, negative numbers are in reverse order, and above the positive ones.
     bits ^ if bits >> 31 == 1 { u32::MAX } else { 1 << 31 }
 }
 
-/// The states among the candidates of one move: a hash table whose keys are hashes already. A round counter clears it
-/// without a write to each slot.
+/// The distinct states among the candidates of one move, as a hash table whose keys are already hashes. Incrementing
+/// the round clears the table without a write to each slot.
 #[derive(Debug)]
 struct SeenStates {
     /// The key, the round of its insertion, and the index of its candidate.
@@ -382,7 +384,7 @@ mod tests {
     use std::collections::HashSet;
 
     #[test]
-    fn beginnings_with_one_end_and_one_set_of_cells_are_merged() {
+    fn partial_paths_with_the_same_state_are_merged() {
         for (height, width, row, col) in [(1, 1, 0, 0), (2, 2, 1, 0), (3, 5, 0, 2), (13, 13, 6, 6)]
         {
             let shape = Shape::new(height, width).expect("test shape");
@@ -408,7 +410,7 @@ mod tests {
     }
 
     #[test]
-    fn bits_order_as_numbers_do() {
+    fn ordered_bits_keep_the_order_of_scores() {
         let infinity = f32::INFINITY;
         let numbers = [-infinity, -2.0, -1e-30, 0.0, 1e-30, 1.0, 3.0, infinity];
         assert!(numbers.map(ordered_bits).is_sorted());

@@ -12,7 +12,8 @@ const LATEST_SHARE: f32 = 0.2;
 /// The freshness of each cell, and recent rewards.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
-    /// `exp(-age / 300)` of each cell, where `age` is the number of steps since it was seen. 0 if it was never seen.
+    /// `exp(-age / 300)` of each cell, where `age` is the number of steps since the cell was last seen. 0 if it was
+    /// never seen.
     freshness: Grid<f32>,
     pub recent: Recent,
 }
@@ -99,7 +100,7 @@ impl Memory {
         memory.is_of(shape).then_some(memory)
     }
 
-    /// Checks that the shape and all numbers are valid for a grid.
+    /// Returns whether the memory fits a grid and all its values are valid.
     pub fn is_of(&self, shape: Shape) -> bool {
         let rewards = [self.recent.last_reward, self.recent.mean_reward];
         self.freshness.dim() == shape.dim()
@@ -116,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cell_is_new_again_as_its_visit_ages() {
+    fn novelty_grows_with_time_since_the_last_visit() {
         let shape = Shape::new(1, 2).expect("test shape");
         let mut memory = Memory::new(shape);
         memory.see(&Frame::from_bytes(shape, 2, &[0, 255]).expect("a frame"));

@@ -1,5 +1,5 @@
-//! The goal of a path. An [`Objective`] and a belief determine [`CellValues`], which planners maximise. They are the
-//! costs `c_1` and `c_2` of paper eqs. 13 and 14 with the opposite sign.
+//! The goal of a path. An [`Objective`] and a belief determine [`CellValues`], which planners maximise. These values
+//! are the costs `c_1` and `c_2` of paper eqs. 13 and 14 with the opposite sign.
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use emberwatch_model::grid::{Cell, Grid, Shape};
@@ -10,12 +10,12 @@ use serde::{Deserialize, Serialize};
 
 /// Bonus of beam search for each distinct cell, in addition to its probability.
 ///
-/// It is just large enough that a robot moves away from a region without value. Without it, a clairvoyant robot stays
-/// where nothing burns, and earns 20.2 +- 8.1 instead of 43.6 +- 6.5 per step. With the filter it makes no difference
-/// (36.4 and 36.6). Both were measured on 8 training worlds with burn-in 25,000 over 1,500 steps.
+/// The bonus is just large enough to make a robot leave a region without value. Without it, a clairvoyant robot stays
+/// where nothing burns, and earns 20.2 +- 8.1 instead of 43.6 +- 6.5 per step. With the filter, the bonus makes no
+/// difference (36.4 and 36.6). Both were measured on 8 training worlds with burn-in 25,000 over 1,500 steps.
 pub const BEAM_BONUS: f32 = 0.02;
 
-/// The belief that paths are planned on.
+/// The belief on which paths are planned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BasisKind {
@@ -32,7 +32,7 @@ pub enum Target {
     State(usize),
     /// The entropy of the belief: the paper's action `a_k = S`.
     Entropy,
-    /// The visit itself, whatever the belief.
+    /// The visit itself, regardless of the belief.
     Coverage,
 }
 
@@ -61,21 +61,22 @@ pub struct Objective {
     pub revisits: bool,
 }
 
-/// The value of each cell of the grid to a planner. All numbers are finite.
+/// The value of each cell of the grid to a planner. All values are finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellValues {
     /// The value of a cell on the path.
     value: Grid<f32>,
     coverage_bonus: f32,
     revisits: bool,
-    /// The value of a cell in sight of the path, if observing cells counts and the sensor sees beyond the path.
+    /// The value of each cell in sight of the path. `None` if only cells on the path count or the sensor sees only
+    /// these.
     in_sight: Option<Grid<f32>>,
     airspace: Airspace,
 }
 
 impl Objective {
-    /// Creates an objective that counts distinct cells once and has no bonus. For [`Target::Coverage`], the bonus is 1,
-    /// so the score is the number of distinct cells.
+    /// Creates an objective that counts each distinct cell once and has no bonus. For [`Target::Coverage`], the bonus
+    /// is 1, so the score is the number of distinct cells.
     pub fn new(target: Target) -> Self {
         let coverage_bonus = if target == Target::Coverage { 1.0 } else { 0.0 };
         Self {
@@ -96,17 +97,17 @@ impl Objective {
         }
     }
 
-    /// Computes the cells' values under a belief, on a grid without no-fly cells and with a sensor that sees the path
-    /// only.
+    /// Computes the cells' values under a belief, on a grid without no-fly cells and with a sensor that sees only the
+    /// path.
     pub fn values(&self, belief: &Belief) -> CellValues {
         self.values_in(belief, &Airspace::open(belief.shape()))
     }
 
-    /// Computes the cells' values under a belief. Entropy counts in all observed cells. Other targets count where the
-    /// reward counts, see [`Airspace::pays`].
+    /// Computes the cells' values under a belief. Entropy counts in all observed cells. The other targets count in the
+    /// cells that the reward counts (see [`Airspace::pays`]).
     ///
     /// # Panics
-    /// If the airspace has another grid.
+    /// If the airspace has a different grid.
     pub fn values_in(&self, belief: &Belief, airspace: &Airspace) -> CellValues {
         let value = match self.target {
             Target::State(state) => belief.probability(state).to_owned(),
@@ -127,7 +128,7 @@ impl Objective {
 }
 
 impl CellValues {
-    /// Creates values from finite numbers of shape `[H, W]`, and a bonus for each distinct cell.
+    /// Creates values from a grid of finite numbers, shape `[H, W]`, and a bonus for each distinct cell.
     pub fn new(value: Grid<f32>, coverage_bonus: f32) -> Self {
         let (height, width) = value.dim();
         let shape = Shape::new(height, width).expect("invariant: a grid of cells");
@@ -140,11 +141,11 @@ impl CellValues {
         }
     }
 
-    /// Applies the no-fly cells and the sensor of an airspace. `in_sight` has an additional finite value for each
+    /// Applies the no-fly cells and the sensor of an airspace. `in_sight` contains an additional finite value for each
     /// distinct cell in sight of the path, shape `[H, W]`.
     ///
     /// # Panics
-    /// If the airspace has another grid.
+    /// If the airspace has a different grid.
     pub fn within(self, airspace: &Airspace, in_sight: Option<Grid<f32>>) -> Self {
         assert_eq!(
             airspace.shape(),
@@ -158,11 +159,11 @@ impl CellValues {
         }
     }
 
-    /// Creates values that count once for each observed cell, from finite numbers of shape `[H, W]`. If the sensor sees
-    /// the path only, these are the cells on the path.
+    /// Creates values that count once for each observed cell, from a grid of finite numbers, shape `[H, W]`. If the
+    /// sensor sees only the path, the observed cells are those on the path.
     ///
     /// # Panics
-    /// If the airspace has another grid.
+    /// If the airspace has a different grid.
     pub fn in_sight_of(airspace: &Airspace, value: Grid<f32>) -> Self {
         if airspace.radius() == 0 {
             return Self::new(value, 0.0).within(airspace, None);
@@ -179,12 +180,12 @@ impl CellValues {
         &self.airspace
     }
 
-    /// Returns the value of each distinct cell in sight of the path, if observing cells counts.
+    /// Returns the value of each distinct cell in sight of the path, if cells in sight count.
     pub fn in_sight(&self) -> Option<&Grid<f32>> {
         self.in_sight.as_ref()
     }
 
-    /// Returns the sum of each cell's values on the path and in sight of it, without the bonus, shape `[H, W]`.
+    /// Returns each cell's value on the path plus its value in sight of the path, without the bonus, shape `[H, W]`.
     pub fn worth(&self) -> Grid<f32> {
         match &self.in_sight {
             None => self.value.clone(),
@@ -213,7 +214,8 @@ impl CellValues {
             .scaled_add(weight, layer);
     }
 
-    /// Returns the values that remain after a teammate's path: cells that it visits or sees are worth nothing.
+    /// Returns the values that remain after a teammate's path: cells that the teammate visits or sees are worth
+    /// nothing.
     ///
     /// `visited` lists the row-major indices of the teammate's cells, and may repeat them. With revisits, cells on the
     /// path keep their value.

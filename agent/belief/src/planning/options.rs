@@ -1,4 +1,5 @@
-//! The options of a high-level decision (paper section III.E). Each option plans a whole path, which features describe.
+//! The options of a high-level decision (paper section III.E). Each option plans a whole path, and a vector of features
+//! describes this path.
 //!
 //! To add an option, add an entry to [`OPTIONS`].
 
@@ -8,14 +9,15 @@ use crate::planning::outlook::{Layer, Outlook, distance};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use emberwatch_model::{Cell, Grid};
 
-/// An option: an objective for paths, with a name.
+/// An option: a named objective for paths.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathOption {
     /// The name in tables and files.
     pub name: &'static str,
     /// A short description.
     pub about: &'static str,
-    /// Weights of a cell's value: a constant bonus, the probability of the paying state, the entropy and the novelty.
+    /// Weights of the terms of a cell's value: a constant bonus, the probability of the paying state, the entropy and
+    /// the novelty.
     worth: [f32; 4],
     /// Number of consecutive paths in the plan, at least 1. The robot flies only the first.
     n_paths: usize,
@@ -53,7 +55,7 @@ pub const OPTIONS: [PathOption; 8] = [
     explore("entropy", "the belief's entropy", [0.0, 0.0, 1.0, 0.0]),
     explore(
         "coverage",
-        "cells that have not been seen for long",
+        "cells that have not been seen for a long time",
         [0.0, 0.0, 0.0, 1.0],
     ),
     PathOption {
@@ -73,22 +75,23 @@ pub const OPTIONS: [PathOption; 8] = [
 /// Number of features of an option: see [`feature_names`].
 pub const N_FEATURES: usize = 18 + OPTIONS.len();
 
-/// Increase of a cell's value per cell of approach to the goal. It outweighs the values of cells off the way.
+/// Increase of a cell's value for each cell that it is closer to the goal. It outweighs the values of cells away from
+/// the direct path.
 const SLOPE: f32 = 0.3;
 
 /// Distance from the goal, in rows and in columns, within which the value does not increase.
 const GOAL_RADIUS: usize = 2;
 
-/// Discount of a region's sum for each path on the way to it.
+/// Discount of a region's sum for each path that the robot needs to reach the region.
 pub const KEPT_PER_PATH: f32 = 0.8;
 
-/// Scales that divide sums over regions, in the order of [`Layer::ALL`].
+/// Divisors that scale the sums over regions, in the order of [`Layer::ALL`].
 const REGION_SCALES: [f32; 4] = [25.0, 12.0, 169.0, 169.0];
 
-/// Scale that divides the grid's mean probability of the paying state.
+/// Divisor that scales the grid's mean probability of the paying state.
 const MEAN_SCALE: f32 = 0.1;
 
-/// Upper limit of the number of flown paths in the features.
+/// Number of flown paths at which the corresponding feature saturates.
 const MOST_STEPS: u64 = 200;
 
 const fn exploit_and(name: &'static str, about: &'static str, entropy: f32) -> PathOption {
@@ -125,7 +128,7 @@ pub struct Proposal {
     pub features: [f32; N_FEATURES],
 }
 
-/// Plans options by beam search.
+/// A planner that computes the paths of options by beam search.
 #[derive(Debug)]
 pub struct OptionPlanner(BeamSearch);
 
@@ -230,7 +233,7 @@ impl Outlook {
     }
 }
 
-/// Computes the features of an option's path. Without a goal, the path's end counts as the goal.
+/// Computes the features of an option's path. If the option has no goal, the end of its path is used instead.
 fn features(
     index: usize,
     outlook: &Outlook,
@@ -274,7 +277,7 @@ fn features(
 ///
 /// - sums of probability, entropy and novelty over the path's distinct cells, per move
 /// - scaled sums of all layers over the region at the path's end, and over the region at the goal
-/// - distance to the goal, as a share of the grid's sides
+/// - distance to the goal, as a fraction of the grid's sides
 /// - scaled surplus of the best region and of the robot's region, and the scaled mean probability of the grid
 /// - last reward per move, its running mean, and number of paths flown
 /// - one-hot code of the option
@@ -366,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn goals_draw_the_robot_whatever_lies_on_its_way() {
+    fn options_with_a_goal_fly_towards_it() {
         let mut planner = OptionPlanner::new(30);
         let (outlook, robot) = (outlook(40, 40, 6), Cell { row: 20, col: 20 });
         for option in OPTIONS.iter().filter(|option| option.goal.is_some()) {
@@ -381,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn every_feature_has_a_name_and_is_of_its_path() {
+    fn every_feature_has_a_name_and_describes_its_path() {
         let names = feature_names();
         let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
         assert_eq!((names.len(), distinct.len()), (N_FEATURES, N_FEATURES));
@@ -412,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rule_leaves_for_a_better_region_only() {
+    fn the_rule_leaves_only_for_a_better_region() {
         let shape = Shape::new(40, 40).expect("test shape");
         let choice = |row: usize| {
             let mut states = Grid::zeros((40, 40));

@@ -6,7 +6,7 @@ use emberwatch_model::Pays;
 use emberwatch_model::{Airspace, Cell, Grid, Shape};
 use ndarray::Zip;
 
-/// Radius of a region. It contains the cells within this number of rows and columns of its centre, inside the grid.
+/// Radius of a region. A region contains all cells of the grid within this number of rows and columns of its centre.
 pub const REGION_RADIUS: usize = 6;
 
 /// Distance between the centres of the regions that are compared, in rows and in columns.
@@ -15,14 +15,14 @@ const CENTRE_STRIDE: usize = 4;
 /// Probability of the paying state above which a cell is worth flying to.
 const LIKELY: f32 = 0.3;
 
-/// A quantity of each cell, from 0 to 1.
+/// A quantity that is defined for each cell, from 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layer {
-    /// Probability of the state that pays most.
+    /// Probability of the state with the highest reward.
     Probability,
-    /// Excess of this probability over 0.3, or 0.
+    /// Excess of this probability over 0.3, or 0 if it is lower.
     Surplus,
-    /// Entropy of the belief, as a share of the maximum `log S`.
+    /// Entropy of the belief, as a fraction of the maximum `log S`.
     Entropy,
     /// [`Memory::novelty`].
     Novelty,
@@ -54,7 +54,7 @@ pub struct Outlook {
 struct Sums(Grid<f64>);
 
 impl Outlook {
-    /// Computes the layers. `target` is the state that pays most.
+    /// Computes the layers. `target` is the state with the highest reward.
     ///
     /// # Panics
     /// If the airspace and the belief have different grids.
@@ -102,7 +102,8 @@ impl Outlook {
         self
     }
 
-    /// Sets layers to 0 in cells that another robot visits, or sees if the layer counts in sight.
+    /// Sets layers to 0 in the cells that another robot visits. Layers that count in sight are also set to 0 in the
+    /// cells that it sees.
     pub fn without(mut self, visited: &[usize]) -> Self {
         let seen = self.airspace.see(visited);
         for layer in Layer::ALL {
@@ -160,8 +161,9 @@ impl Outlook {
         along(height).flat_map(move |row| along(width).map(move |col| Cell { row, col }))
     }
 
-    /// Returns the centre of the best region that is more than half a path away, by the layer's discounted sum. Each
-    /// path on the way there multiplies the sum by `kept_per_path`. If all sums are 0, returns the robot's own cell.
+    /// Returns the centre of the region with the highest discounted sum of a layer, among those more than half a path
+    /// away. Each path on the way there multiplies the sum by `kept_per_path`. If all sums are 0, returns the robot's
+    /// cell.
     pub fn best_region(&self, layer: Layer, robot: Cell, kept_per_path: f32) -> Cell {
         let mut best = (0.0, robot);
         for centre in self.centres() {
@@ -220,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn sums_around_a_cell_are_those_of_its_region() {
+    fn sums_around_a_cell_agree_with_plain_sums() {
         for (height, width) in [(1, 1), (3, 20), (20, 15), (64, 64)] {
             let outlook = outlook(height, width);
             let cells = |layer| outlook.layer(layer).indexed_iter();
@@ -241,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn the_best_region_is_away_and_worth_its_way() {
+    fn the_best_region_trades_value_against_distance() {
         let shape = Shape::new(64, 64).expect("test shape");
         let mut states = Grid::zeros((64, 64));
         // Two fires: a burning cell nearby, and two burning cells several paths away.

@@ -26,7 +26,7 @@ pub struct Plan {
     pub score: f32,
 }
 
-/// An algorithm that finds paths. The same problem always has the same plan.
+/// An algorithm that finds paths. The same problem always results in the same plan.
 pub trait Planner {
     /// Plans a path of exactly `problem.n_moves` moves.
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan;

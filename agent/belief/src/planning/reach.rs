@@ -1,5 +1,5 @@
-//! The [`Reach`] is the part of the grid that a path can reach. With it, the time to plan depends on the path's length,
-//! not on the grid's size.
+//! The [`Reach`] is the part of the grid that a path can reach. Planners search only this part, so their run time
+//! depends on the path's length, not on the grid's size.
 
 use crate::planning::planner::PlanningProblem;
 use emberwatch_model::grid::Cell;
@@ -8,8 +8,8 @@ use std::ops::Range;
 
 /// The rectangle of cells within T rows and T columns of the start, and their values.
 ///
-/// No path of T moves crosses a border of the reach that lies inside the grid. So clamping moves to the reach has the
-/// same effect as clamping them to the grid.
+/// No path of T moves crosses a border of the reach that lies inside the grid. Clamping moves to the reach therefore
+/// has the same effect as clamping them to the grid.
 #[derive(Debug, Default)]
 pub(super) struct Reach {
     pub rows: usize,
@@ -87,7 +87,8 @@ impl Reach {
         row as usize * self.cols + col as usize
     }
 
-    /// Returns the cell after a move. A move off the reach leaves the robot in place, like [`Move::apply`] on the grid.
+    /// Returns the cell after a move. A move off the reach leaves the robot in place, as [`Move::apply`] does on the
+    /// grid.
     #[inline]
     pub fn after(&self, step: Move, row: u32, col: u32) -> (u32, u32) {
         match step {
@@ -104,8 +105,8 @@ impl Sight {
         self.rows * self.cols
     }
 
-    /// Returns the rows and columns that a move between two cells of the reach may show for the first time. `was_seen`
-    /// is whether the surroundings of the first cell are already seen.
+    /// Returns the rows and columns that a move between two cells of the reach can show for the first time. If
+    /// `was_seen` is set, the surroundings of the first cell have already been seen.
     #[inline]
     fn newly_seen(&self, from: (u32, u32), to: (u32, u32), was_seen: bool) -> [Range<usize>; 2] {
         let around = |at: u32, first: usize, side: usize| {
@@ -133,7 +134,7 @@ impl Sight {
         }
     }
 
-    /// Returns the value of the cells that a move shows for the first time. `seen` has a bit for each cell.
+    /// Returns the value of the cells that a move shows for the first time. `seen` contains one bit for each cell.
     #[inline]
     pub fn gain(&self, seen: &[u64], from: (u32, u32), to: (u32, u32), was_seen: bool) -> f32 {
         let [rows, cols] = self.newly_seen(from, to, was_seen);

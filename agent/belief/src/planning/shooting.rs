@@ -17,19 +17,19 @@ const MOVES_PER_WORD: usize = 32;
 /// Number of samples whose positions are computed in parallel: two SSE registers of `i16`.
 const LANES: usize = 16;
 
-/// Row and column that each [`Move`] adds, in the order of its wire value.
+/// Change in row and column for each [`Move`], in the order of their wire values.
 const OFFSETS: [(i32, i32); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
 
 /// The rule that converts a sample's moves to cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Integration {
-    /// Each move is clamped to the grid on its own, as the robot does.
+    /// Each move is clamped to the grid separately, as in a flight.
     #[default]
     ClampEachMove,
     /// The moves are summed without regard to the grid, and each partial sum is clamped, as in the authors' code. A
-    /// sample that leaves the grid by five cells stays at the border until it has returned by five. The robot reaches
-    /// the same cells by moves against the border.
+    /// sample that leaves the grid by five cells stays at the border until it has returned by five. The robot visits
+    /// the same cells by moving against the border.
     ClampSum,
 }
 
@@ -41,9 +41,9 @@ pub struct Shooting {
     reach: Reach,
     slots: Vec<Slot>,
     stamp: u32,
-    /// The random bits of [`LANES`] samples, one sample after the other.
+    /// The random bits of [`LANES`] samples, stored sample by sample.
     words: Vec<u64>,
-    /// The cells that these samples visit, one move after the other.
+    /// The cells that these samples visit, stored move by move.
     cells: Vec<[(i16, i16); LANES]>,
 }
 
@@ -57,7 +57,7 @@ struct Slot {
 }
 
 impl Integration {
-    /// Returns the moves by which the robot, which clamps each move, visits the cells of a sample.
+    /// Returns the moves with which the robot visits the cells of a sample, given that each move is clamped in flight.
     ///
     /// Successive clamped sums are one cell apart, or equal. If they are equal, the sum is beyond a border, and the
     /// robot moves against that border to stay in place.
@@ -160,7 +160,7 @@ impl Shooting {
     /// Computes the score of the sample in one lane.
     ///
     /// Whether a cell is new is as unpredictable as the moves, so a branch makes the loop 3.5 times slower (measured).
-    /// The compiler would turn an `if` or a mask into a branch, so the code uses it as an index.
+    /// The compiler would turn an `if` or a mask into a branch, so the code uses the condition as an index.
     fn score(&mut self, lane: usize) -> f32 {
         self.stamp += 1;
         let mut score = 0.0;

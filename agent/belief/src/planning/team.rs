@@ -1,8 +1,8 @@
 //! A joint plan for several robots. A cell that one of them visits is worth nothing to its teammates.
 //!
 //! The robots plan one after the other, each on the values that remain after its teammates' paths. Then each robot
-//! plans again, given all other paths (best response), and keeps the better of its two paths. So the team's value never
-//! falls.
+//! plans again, given all other paths (best response), and keeps the better of its two paths. The team's value
+//! therefore never decreases.
 
 use crate::planning::objective::CellValues;
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
@@ -62,7 +62,7 @@ pub fn plan_team(
     plans
 }
 
-/// Returns the seed of a robot's random numbers. The first robot has the world's seed.
+/// Returns the seed of a robot's random numbers. The first robot uses the world's seed.
 pub fn robot_seed(seed: u64, robot: usize) -> u64 {
     match robot {
         0 => seed,

@@ -10,7 +10,7 @@ use emberwatch_model::{Cell, Move, Shape};
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 
-/// Robots, and the cells' values to them.
+/// The robots of a team, and the values of cells to the team.
 struct Team<'a> {
     field: &'a Field,
     values: CellValues,
@@ -27,7 +27,7 @@ impl<'a> Team<'a> {
         plan_team(planner, &self.values, starts, n_moves, RANDOM, rounds)
     }
 
-    /// Returns the team's gain. Each cell counts once, however many robots visit it, unless each visit counts.
+    /// Returns the team's gain. Each cell counts once, however many robots visit it, unless revisits count.
     fn worth(&self, plans: &[Plan]) -> f64 {
         let paths: Vec<&[Move]> = plans.iter().map(|plan| &*plan.moves).collect();
         self.worth_of(&paths)
@@ -50,7 +50,7 @@ impl<'a> Team<'a> {
     }
 }
 
-/// Tolerance for sums of `f32` in another order.
+/// Tolerance for `f32` sums in a different order.
 const ROUNDING: f64 = 1e-4;
 
 proptest! {
@@ -93,7 +93,7 @@ fn two_robots_gain_nearly_what_the_best_pair_of_paths_gains() {
             let starts = starts.map(|(row, col)| Cell { row, col }).to_vec();
             let field = Field::new(shape, starts, 2, seed);
             let team = Team::new(&field, Objective::new(Target::State(0)));
-            // A beam of width 16 holds all paths.
+            // A beam of width 16 contains all paths.
             let plan = |rounds| team.worth(&team.plan(&mut BeamSearch::new(16), rounds));
             let pairs = paths.iter().flat_map(|a| paths.iter().map(move |b| (a, b)));
             let optimum = pairs.map(|(a, b)| team.worth_of(&[a, b]));

@@ -90,7 +90,7 @@ impl AutoencoderEstimator {
         Ok(Self::at(network, Follower::new(network)?))
     }
 
-    /// Creates an estimator that continues from a follower of the network.
+    /// Creates an estimator that continues from a recurrent state of the network.
     pub fn at(network: &Autoencoder, follower: Follower) -> Self {
         Self {
             network: network.clone(),

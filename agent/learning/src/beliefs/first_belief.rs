@@ -1,4 +1,5 @@
-//! A filter's first belief. Its simulation may take long, so it is logged, and the result is cached for later runs.
+//! A filter's first belief. Its simulation can take long, so a log message announces it, and the result is cached for
+//! later runs.
 
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::kept_belief::KeptBelief;
@@ -6,7 +7,7 @@ use emberwatch_belief::estimation::prior::Prior;
 use emberwatch_model::ModelError;
 use emberwatch_model::{Model, Shape};
 
-/// Cell steps per second and core: 64 x 64 cells of the wildfire in 3.4 us.
+/// Simulated cell steps per second per core: 64 x 64 cells of the wildfire take 3.4 us.
 const CELLS_PER_SECOND: f64 = 1.2e9;
 
 /// Returns the belief before the first frame, from the cache if possible. See [`Prior::belief`].

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 /// The recurrent state of a network in one world. All methods must receive the same network.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Follower {
-    /// `h_k`.
+    /// The hidden vector `h_k`.
     pub hidden: Vec<f32>,
     /// The predictor `u_{k+1}`.
     pub prediction: Belief,

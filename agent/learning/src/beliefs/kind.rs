@@ -21,9 +21,9 @@ pub struct BeliefKind {
     pub knows_model: bool,
     /// The learner of this kind. `None` if nothing is learned.
     pub learned_by: Option<LearnedBy>,
-    /// Legend and colour (red, green, blue) of its policies in charts.
+    /// Legend text and colour (red, green, blue) of its policies in charts.
     pub chart: (&'static str, [u8; 3]),
-    /// Names the format in which agents hand over this belief. Only for kinds that know the model.
+    /// Returns the name of the format in which agents hand over this belief. Only for kinds that know the model.
     pub handover: Option<fn(&Model) -> String>,
     /// Builds an estimator before its first frame.
     pub build: fn(&Conditions<'_>) -> Result<Box<dyn Estimator>>,
@@ -36,7 +36,7 @@ pub enum Input {
     Frames,
     /// The hidden states X_k, for oracles.
     States,
-    /// The hidden states X_{k+1} that the next path will meet, for clairvoyants.
+    /// The hidden states X_{k+1} that the next path will encounter, for clairvoyants.
     NextStates,
 }
 
@@ -44,7 +44,7 @@ pub enum Input {
 pub struct LearnedBy {
     /// Name, as in `train --learner NAME`.
     pub learner: &'static str,
-    /// Whether it also learns which objective to plan for (paper Algorithm 1).
+    /// Whether this learner also learns which objective to plan for (paper Algorithm 1).
     pub decides: bool,
     /// Finds the learned model among the values from checkpoints.
     pub find: fn(&Learned) -> Option<&dyn LearnedBelief>,
@@ -85,7 +85,7 @@ impl<'a> Conditions<'a> {
     /// Returns the first belief.
     ///
     /// # Errors
-    /// If there is none.
+    /// If there is no first belief.
     pub fn prior(&self) -> Result<Belief> {
         let prior = self.prior.cloned();
         prior.context("prior: expected a first belief, got none")
@@ -98,7 +98,7 @@ impl BeliefKind {
         self.learned_by.as_ref().is_some_and(|by| by.decides)
     }
 
-    /// Returns the learned model. `None` if this kind needs none.
+    /// Returns the learned model, or `None` if this kind does not use one.
     ///
     /// # Errors
     /// If this kind needs a learned model and no checkpoint contains it.
@@ -115,7 +115,7 @@ impl BeliefKind {
         })
     }
 
-    /// Checks that the belief can be built for worlds of a form, given the checkpoints.
+    /// Checks that the belief can be built for worlds of the given form with the given checkpoints.
     ///
     /// # Errors
     /// If the learned model is missing, or was learned in worlds of another form.
@@ -135,10 +135,10 @@ impl BeliefKind {
         })
     }
 
-    /// Returns the belief's index of the state with the highest reward.
+    /// Returns the index, in the belief, of the state with the highest reward.
     ///
     /// # Errors
-    /// Like [`Self::state_names`].
+    /// Under the same conditions as [`Self::state_names`].
     pub fn target(&self, conditions: &Conditions<'_>) -> Result<usize> {
         Ok(match self.learned(conditions.learned)? {
             Some(learned) => learned.target(),
@@ -159,7 +159,7 @@ impl fmt::Debug for BeliefKind {
     }
 }
 
-/// Returns names for learned states.
+/// Returns names for learned states, such as `state 0`.
 pub fn numbered_states(n_states: usize) -> Vec<String> {
     let states = 0..n_states;
     states.map(|state| format!("state {state}")).collect()

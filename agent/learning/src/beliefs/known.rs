@@ -1,6 +1,6 @@
 //! Bayes filters with the true model (paper section III.A, masked as in III.C).
 //!
-//! They differ in their prediction (mean field, second order or cavities), and in whether corrections reach the
+//! The kinds differ in their prediction (mean field, second order or cavities), and in whether corrections reach the
 //! neighbours of visited cells.
 
 use super::kind::{BeliefKind, Conditions, Input};
@@ -63,7 +63,7 @@ fn filter(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<BayesFilt
     Ok(BayesFilter::known(model, conditions.prior()?)?.predicting_known(model, kind))
 }
 
-/// Builds the filter with the true model whose corrections reach the neighbours of visited cells.
+/// Builds a filter with the true model. Its corrections reach the neighbours of visited cells.
 fn spatial(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<SpatialFilter> {
     let (filter, state) = (
         filter(conditions, kind)?,
@@ -72,7 +72,7 @@ fn spatial(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<SpatialF
     Ok(SpatialFilter::new(filter, state, Correlations::default()))
 }
 
-/// Names the handover format of a spatial filter, see `Handover::kind`.
+/// Returns the name of the handover format of a spatial filter, see `Handover::kind`.
 fn spatial_handover(model: &Model, kind: PredictionKind) -> String {
     SpatialFilter::handover_of(
         &BayesFilter::handover_of_known(model, kind),

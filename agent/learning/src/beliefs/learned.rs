@@ -1,7 +1,7 @@
 //! Bayes filters with learned parameters.
 //!
-//! They differ in their prediction, and in whether corrections reach the neighbours of visited cells. Their kernels may
-//! depend on a cell's own state: a checkpoint stores this as the shape of the kernel tensor.
+//! The kinds differ in their prediction, and in whether corrections reach the neighbours of visited cells. Kernels can
+//! depend on a cell's own state, which a checkpoint records only in the shape of the kernel tensor.
 
 use super::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy};
 use super::world_form::WorldForm;
@@ -72,7 +72,7 @@ fn model<'a>(conditions: &Conditions<'a>) -> Result<&'a LearnedModel> {
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedModel {
     pub parameters: Parameters,
-    /// The weights and probabilities that the parameters stand for.
+    /// The weights and probabilities computed from the parameters.
     pub tables: Tables,
     /// The state with the highest reward.
     pub target: usize,
@@ -90,7 +90,7 @@ impl LearnedModel {
         }
     }
 
-    /// Builds an estimator with the belief before the first frame.
+    /// Builds an estimator before its first frame.
     ///
     /// If `is_spatial`, corrections reach the neighbours of visited cells.
     pub fn estimator(
@@ -144,7 +144,7 @@ impl SavedModel {
         }
     }
 
-    /// Loads the model with the tensors of a checkpoint.
+    /// Loads the model, with its tensors from a part of a checkpoint.
     pub fn read(&self, part: &Part<'_>) -> Result<LearnedModel> {
         let dimensions = dimensions_of(self.dimensions, part)?;
         let parameters = read_parameters(dimensions, part, "")?;
@@ -174,17 +174,17 @@ pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] 
     })
 }
 
-/// Whether a stored filter has own-state kernels: their tensor has five axes.
+/// Whether a stored filter has own-state kernels, whose tensor has five axes.
 pub fn sees_own_state(part: &Part<'_>) -> bool {
     let shape = part.shape(Parameters::NAMES[0]);
     shape.is_some_and(|shape| shape.len() == 5)
 }
 
-/// Completes the dimensions of a stored filter with those that only its tensors reveal: the number of observation
+/// Completes the dimensions of a stored filter with the values that only its tensors reveal: the number of observation
 /// matrices, and whether there are own-state kernels.
 ///
 /// # Errors
-/// If they are out of range, or the filter has kernels for zones.
+/// If a dimension is out of range, or the filter has kernels for zones.
 pub fn dimensions_of(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensions> {
     check(
         part.shape("zones").is_none(),

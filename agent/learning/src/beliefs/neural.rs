@@ -1,9 +1,9 @@
 //! The neural belief: an estimator whose network predicts the next observation of each cell.
 //!
-//! The network reads each cell's last observation and its age. It may also read a filter's prediction and correct it.
+//! The network reads each cell's last observation and its age. It can also read a filter's prediction and correct it.
 //!
-//! The belief is about observations instead of states, so S = O. After a frame, it is certain of the observations of
-//! visited cells. If the observation matrix is known, the belief is about states: `sensor.rs` converts predicted
+//! The belief is about observations instead of states, so S = O. After a frame, the observations of visited cells have
+//! probability 1. If the observation matrix is known, the belief is about states: `sensor.rs` converts predicted
 //! observations to states, and a frame corrects the states by Bayes' rule (eq. 5).
 
 mod sensor;
@@ -27,7 +27,7 @@ use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::borrow::Cow;
 
-/// Prefix of the tensor names of the corrected filter.
+/// Prefix of the names of the corrected filter's tensors.
 const FILTER: &str = "filter.";
 
 pub const NEURAL: BeliefKind = BeliefKind {
@@ -76,7 +76,7 @@ pub struct NeuralModel {
     pub target: usize,
 }
 
-/// Models are equal if their beliefs are.
+/// Models are equal if their targets, filters and network parameters are equal.
 impl PartialEq for NeuralModel {
     fn eq(&self, other: &Self) -> bool {
         let parameters = |model: &Self| model.network.parameters().ok();
@@ -87,7 +87,7 @@ impl PartialEq for NeuralModel {
 }
 
 impl NeuralModel {
-    /// Builds an estimator with the belief before the first frame.
+    /// Builds an estimator before its first frame.
     pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator> {
         estimator(&self.network, self.filter.as_deref(), shape)
     }
@@ -116,7 +116,7 @@ impl LearnedBelief for NeuralModel {
     }
 }
 
-/// Builds an estimator with the belief before the first frame.
+/// Builds an estimator before its first frame.
 ///
 /// Corrections of the filter, if there is one, reach the neighbours of visited cells.
 pub fn estimator(
@@ -176,7 +176,7 @@ impl SavedNeuralModel {
         }
     }
 
-    /// Loads the model with the tensors of a checkpoint. The network computes on `device`.
+    /// Loads the model, with its tensors from a part of a checkpoint. The network computes on `device`.
     pub fn read(&self, part: &Part<'_>, device: &Device) -> Result<NeuralModel> {
         check_target(self.target, self.n_observations)?;
         let mut network = new_network(self.n_observations, device)?;
@@ -196,12 +196,12 @@ pub struct NeuralEstimator {
     network: NeuralBelief,
     /// The filter whose prediction the network corrects, if any.
     filter: Option<Box<dyn Estimator>>,
-    /// The observations that the filter predicts, `[O, H, W]`.
+    /// The distribution over observations that the filter predicts, shape `[O, H, W]`.
     base: Option<Probabilities>,
     sightings: Sightings,
     /// The belief about the next observation of each cell, or about its state if the sensor is known.
     belief: Belief,
-    /// `P(y | x)` of the known sensor, shape `[S, O]`. Otherwise the identity.
+    /// `P(y | x)` of the sensor, shape `[S, O]`, or the identity if the sensor is unknown.
     likelihood: Array2<f64>,
     /// The inverse of `likelihood`, if the sensor is known.
     inverse: Option<Array2<f64>>,
@@ -230,7 +230,8 @@ impl NeuralEstimator {
         })
     }
 
-    /// Makes the belief about states. `likelihood` is the sensor's observation matrix `P(y | x)`, shape `[S, S]`.
+    /// Converts the belief to a belief about states. `likelihood` is the sensor's observation matrix `P(y | x)`, shape
+    /// `[S, S]`.
     ///
     /// # Errors
     /// If the matrix has another shape or no inverse.
@@ -354,7 +355,7 @@ impl Handover for NeuralEstimator {
     }
 }
 
-/// Predicts several estimators. Worlds with the same network are predicted in one pass.
+/// Runs the predictions of several estimators. Worlds with the same network and grid share one pass.
 fn predict_together(estimators: Vec<&mut dyn Estimator>) {
     let (mut networks, mut others) = (Vec::<&mut NeuralEstimator>::new(), Vec::new());
     for estimator in estimators {
@@ -383,13 +384,14 @@ impl NeuralEstimator {
         }
     }
 
-    /// Returns the key by which worlds are grouped into passes: network, grid, and whether a filter is corrected.
+    /// Returns the key by which worlds are grouped into passes: the network, the grid, and whether the network corrects
+    /// a filter.
     fn pass_key(&self) -> (usize, [usize; 2], bool) {
         let (height, width) = self.sightings.shape().dim();
         (self.network.id(), [height, width], self.base.is_some())
     }
 
-    /// Predicts the worlds of one group. A failure is recorded for every world of the group.
+    /// Runs the predictions for one group of worlds. A failure is recorded in every estimator of the group.
     fn predict_all(all: &mut [&mut Self]) {
         let worlds = all.iter().map(|it| (&it.sightings, it.base.as_ref()));
         let predicted = all[0].network.predict_all(&worlds.collect::<Vec<_>>());

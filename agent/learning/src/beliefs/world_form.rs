@@ -7,7 +7,7 @@ use emberwatch_model::{Model, Shape};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WorldForm {
     pub shape: Shape,
-    /// Number of values that a cell may show, for all observation matrices together.
+    /// Number of values that can be observed in a cell, for all observation matrices together.
     pub n_observations: usize,
     /// Number of observation matrices of the sensor, at least 1.
     pub n_matrices: usize,
@@ -23,7 +23,7 @@ impl WorldForm {
         }
     }
 
-    /// Checks a belief's number of observations and of observation matrices.
+    /// Checks a belief's number of observations, and its number of observation matrices.
     pub fn check_observations(&self, n_observations: usize, n_matrices: usize) -> Result<()> {
         let (expected, got) = (self.n_observations, n_observations);
         ensure!(

@@ -7,10 +7,10 @@ use emberwatch_network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Maximum decay of Adam's means. It is below 1, so that the means change.
+/// Maximum decay rate of Adam's moving averages. At 1, the averages would never change.
 const MAX_BETA: f64 = 0.999_999;
 
-/// Terms that planners maximise besides the target in a policy's name (paper eqs. 13 to 15).
+/// Terms that planners maximise in addition to the target that the policy's name specifies (paper eqs. 13 to 15).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ObjectiveConfig {
     pub shooting_bonus: f32,
@@ -47,7 +47,7 @@ pub struct LearningConfig {
 pub enum KernelKind {
     /// The states of the neighbours (paper eq. 4).
     Neighbours,
-    /// Also the cell's own state: there is one kernel for each own state.
+    /// The states of the neighbours and of the cell itself: there is one kernel for each state of the cell itself.
     Own,
 }
 
@@ -78,7 +78,7 @@ impl KernelKind {
 impl fmt::Display for KernelKind {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let found = Self::ALL.iter().find(|(kind, ..)| kind == self);
-        formatter.write_str(found.expect("invariant: the table has each").1)
+        formatter.write_str(found.expect("invariant: the table has every kind").1)
     }
 }
 
@@ -308,7 +308,7 @@ impl StepSize {
     }
 }
 
-/// Returns the range of a number of states. 0 means as many states as observations.
+/// Returns the permitted range of a number of states. 0 means as many states as observations.
 fn states(states: usize) -> Range<'static> {
     let least = if states == 0 { 0.0 } else { 2.0 };
     ("states", states as f64, least, 64.0)
@@ -320,7 +320,7 @@ mod tests {
     use crate::config::AgentConfig;
 
     #[test]
-    fn the_autoencoders_steps_vanish_against_the_dqns() {
+    fn the_autoencoders_step_size_falls_faster_than_the_dqns() {
         let AgentConfig {
             autoencoder, dqn, ..
         } = AgentConfig::default();
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn the_step_size_stays_falls_and_stays() {
+    fn the_step_size_is_constant_falls_and_is_constant_again() {
         let config = LearningConfig {
             steady_updates: 10,
             falling_updates: 10,

@@ -1,9 +1,9 @@
-//! Adam (Kingma and Ba, 2015, algorithm 1) on the filter's three tensors.
+//! Adam (Kingma and Ba, 2015, algorithm 1) for the filter's three tensors.
 
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use serde::{Deserialize, Serialize};
 
-/// Added to the root of the second moment, as in that paper.
+/// A constant added to the square root of the second moment, as in the Adam paper.
 const EPSILON: f64 = 1e-8;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -22,7 +22,8 @@ impl Adam {
         }
     }
 
-    /// Makes one step. `rates` has a step size for each tensor, and the betas are the decays of the two means.
+    /// Makes one step. `rates` contains the step size of each tensor, and the betas are the decay rates of the two
+    /// moments.
     pub fn step(
         &mut self,
         parameters: &mut Parameters,
@@ -56,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_step_is_the_rate_against_the_sign() {
+    fn the_first_step_has_the_size_of_the_rate() {
         let dimensions = Dimensions {
             n_states: 2,
             n_observations: 2,
@@ -75,7 +76,7 @@ mod tests {
             assert!(near, "{got:?} {expected:?}");
         };
         close(&parameters.tensors[0], &[-0.5, 0.5, 0.0, -0.5]);
-        // Then the negative gradient: the mean is (.9 * .1 - .1) g = -.01 g, divided by 1 - .81. The mean square is g^2
+        // The second gradient is -g: the mean is (.9 * .1 - .1) g = -.01 g, divided by 1 - .81. The mean square is g^2
         // again.
         gradient.tensors[0] = vec![-3.0, 0.2, 0.0, -1.0];
         adam.step(&mut parameters, &gradient, rates, betas);

@@ -1,24 +1,24 @@
 //! Correlations of planes with dense kernels, and their derivatives with respect to the weights.
 //!
-//! [`emberwatch_model::Transition`] also computes the forward part. It is fast for sparse or repeated weights, which
+//! [`emberwatch_model::Transition`] also computes the forward pass. It is fast for sparse or repeated weights, which
 //! learned kernels lack, and it has no gradient.
 
 use crate::gradient::layout::{LANES, Layout};
 use pulp::{Simd, bytemuck};
 use std::ops::Range;
 
-/// Number of planes computed at once. Together with [`WIDE`] vectors of cells, they fill the registers.
+/// Number of planes computed at once. Together with [`WIDE`] vectors of cells per plane, they fill the SIMD registers.
 const GROUP: usize = 3;
 
 /// Number of vectors of cells computed at once.
 const WIDE: usize = 4;
 
-/// `to[m] = base[m] + sum_n sum_a w[m, n, a] from[n, . + a]`.
+/// A convolution from planes to planes: `to[m] = base[m] + sum_n sum_a w[m, n, a] from[n, . + a]`.
 #[derive(Debug, Clone)]
 pub(super) struct Convolution {
     layout: Layout,
     n_from: usize,
-    /// `w[to, from, row, col]`.
+    /// The weights `w[to, from, row, col]`.
     weights: Vec<f32>,
 }
 
@@ -26,9 +26,9 @@ pub(super) struct Convolution {
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Base<'a> {
     Zero,
-    /// One number for each plane.
+    /// One value per plane.
     Biases(&'a [f32]),
-    /// The present values of the planes.
+    /// The current values of the planes.
     Planes,
 }
 
@@ -45,7 +45,8 @@ impl Convolution {
         self.weights.len() / (self.n_from * self.layout.n_taps())
     }
 
-    /// Returns the convolution of the derivatives, from `to` to `from`: `w[from, to, KH - 1 - row, KW - 1 - col]`.
+    /// Returns the convolution that takes derivatives from `to` back to `from`, with the weights
+    /// `w[from, to, KH - 1 - row, KW - 1 - col]`.
     pub(super) fn turned(&self) -> Self {
         let (n_from, n_taps) = (self.n_from, self.layout.n_taps());
         let mut turned = Vec::with_capacity(self.weights.len());
@@ -78,7 +79,7 @@ impl Convolution {
         }
     }
 
-    /// Computes a row for `G` planes, from `first` on.
+    /// Computes a row for `G` planes, starting with plane `first`.
     #[inline(always)]
     fn group<S: Simd, const G: usize>(
         &self,
@@ -152,7 +153,8 @@ impl Convolution {
         }
     }
 
-    /// Adds the derivatives with respect to the weights. `h`, the derivatives of the result, are zero outside `region`.
+    /// Adds the derivatives with respect to the weights to `gradient`. `h` contains the derivatives with respect to the
+    /// result, which are zero outside `region`.
     #[inline(always)]
     pub(super) fn add_weight_gradient<S: Simd>(
         &self,
@@ -177,7 +179,7 @@ impl Convolution {
         }
     }
 
-    /// Adds the gradient of one row of the kernel from a plane to `G` planes, three weights at a time.
+    /// Adds the gradient of one kernel row, from one plane to `G` planes, three weights at a time.
     #[inline(always)]
     fn taps<S: Simd, const G: usize>(
         &self,
@@ -204,7 +206,7 @@ impl Convolution {
         }
     }
 
-    /// Adds the gradient of `C` weights in a row of the kernel, from `first` on.
+    /// Adds the gradient of `C` weights in a kernel row, starting with weight `first`.
     #[inline(always)]
     fn some_taps<S: Simd, const G: usize, const C: usize>(
         &self,
@@ -243,7 +245,7 @@ impl Convolution {
     }
 }
 
-/// Rows and columns outside of which a gradient is zero. The columns are whole vectors.
+/// The rows and columns within which a gradient can be non-zero. The columns form whole SIMD vectors.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Region {
     pub(super) rows: Range<usize>,
@@ -273,7 +275,7 @@ impl Region {
         }
     }
 
-    /// Returns the indices of the vectors in a row.
+    /// Returns the index of each of the region's SIMD vectors in a row.
     #[inline(always)]
     pub(super) fn places<S: Simd>(
         &self,

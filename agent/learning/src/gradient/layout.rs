@@ -2,10 +2,10 @@
 
 use emberwatch_model::Shape;
 
-/// Number of cells in the widest SIMD vectors. It is a multiple of the vector length of every processor.
+/// Number of cells in the widest SIMD vector, which is a multiple of every processor's vector length.
 pub(super) const LANES: usize = 16;
 
-/// Planes with margins of half a kernel. The width is a multiple of [`LANES`], with at least [`LANES`] further columns.
+/// Planes with margins of half a kernel. Rows are padded to a multiple of [`LANES`], plus [`LANES`] further columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
     pub(super) shape: Shape,

@@ -3,18 +3,20 @@
 //! Forward: `v[m] = sum_n sum_a w[m, n, a] p[n, . + a]` and `u = v / sum_m v`.
 //! Backward, from `g = dL/du`: `h = dL/dv = (g - sum_m g[m] u[m]) / sum_m v`, and
 //! `dL/dw[m, n, a] = sum_cells h[m] p[n, . + a]`. `dL/dp` is the correlation of `h` with the kernel, rotated by 180
-//! degrees and with its states exchanged.
+//! degrees and with its two state axes exchanged.
 //!
-//! With own-state kernels, there is one kernel for each state `o` of the cell itself, and its centre sees `o`. Forward:
-//! `u[m] = sum_o p[o] q[o, m]` with `q[o, m] = v[o, m] / sum_m v[o, m]`. Backward, with `d[o] = sum_m g[m] q[o, m]`:
-//! `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has the additional term `d[o]`.
+//! With own-state kernels, there is one kernel for each state `o` of the cell itself, whose centre weight applies to
+//! `o` only. Forward: `u[m] = sum_o p[o] q[o, m]` with `q[o, m] = v[o, m] / sum_m v[o, m]`. Backward, with
+//! `d[o] = sum_m g[m] q[o, m]`: `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has the additional term
+//! `d[o]`.
 
 use crate::gradient::convolution::{Base, Convolution, Region, load, store};
 use crate::gradient::layout::Layout;
 use pulp::Simd;
 use std::ops::Range;
 
-/// The operator for a grid. Weights are `w[to, from, row, col]`, with own-state kernels `w[own, to, from, row, col]`.
+/// The operator for a grid. Weights are `w[to, from, row, col]`, or `w[own, to, from, row, col]` with own-state
+/// kernels.
 #[derive(Debug, Clone)]
 pub(super) struct Operator {
     pub(super) layout: Layout,
@@ -45,7 +47,7 @@ impl Operator {
     }
 
     /// Computes `u = Phi_w(p)`. Without own-state kernels, `factors` (one plane) receives `1 / sum_m v`, which is 0
-    /// outside of the grid. With own-state kernels, `v` is a buffer.
+    /// outside of the grid. With own-state kernels, `v` is a scratch buffer.
     #[inline(always)]
     pub(super) fn forward<S: Simd>(
         &self,
@@ -69,7 +71,7 @@ impl Operator {
         }
     }
 
-    /// Computes `h` from `g` in a region. With own-state kernels, it replaces `g` by `d` and overwrites `u`.
+    /// Computes `h` from `g` in a region. With own-state kernels, it replaces `g` with `d` and overwrites `u`.
     #[inline(always)]
     pub(super) fn backward_normalise<S: Simd>(
         &self,
@@ -88,7 +90,7 @@ impl Operator {
                     }
                 }
                 Some(centres) => {
-                    // Whole rows are computed: h is 0 where g is 0.
+                    // Whole rows can be computed, because h is 0 where g is 0.
                     self.forward.row(simd, p, h, Base::Biases(centres), row);
                     self.unmix(simd, p, u, g, h, row);
                 }
@@ -111,7 +113,8 @@ impl Operator {
     }
 
     /// Completes the gradient of own-state kernels. The derivative with respect to a centre weight is the sum of `h`
-    /// over all cells. As beliefs sum to one, this equals the sum of the centre's derivatives over all seen states.
+    /// over all cells. As beliefs sum to one, this equals the sum of the derivatives with respect to the centre weights
+    /// of all states.
     pub(super) fn end_gradient(&self, gradient: &mut [f64]) {
         if self.centres.is_some() {
             end_gradient(&self.layout, gradient);
@@ -150,7 +153,7 @@ impl Operator {
         }
     }
 
-    /// Computes `h` for one vector of cells, the reverse of [`Self::normalise`].
+    /// Computes `h` for one vector of cells, by backpropagation through [`Self::normalise`].
     #[inline(always)]
     fn unnormalise<S: Simd>(
         &self,
@@ -198,7 +201,7 @@ impl Operator {
         }
     }
 
-    /// Applies [`Self::mix`] backward to one row: replaces `v` (in `h`) by `h`, and `g` by `d`.
+    /// Backpropagates through [`Self::mix`] in one row: replaces `v` (in `h`) with `h`, and `g` with `d`.
     #[inline(always)]
     fn unmix<S: Simd>(
         &self,
@@ -237,7 +240,7 @@ impl Operator {
         }
     }
 
-    /// Returns `1 / sum_m v` for the planes from `first` on, which is 0 outside of the grid.
+    /// Returns `1 / sum_m v` for the planes from `first` on, or 0 outside of the grid.
     #[inline(always)]
     fn factor<S: Simd>(&self, simd: S, v: &[f32], first: usize, at: usize, col: usize) -> S::f32s {
         let mask = load::<S>(&self.mask, col);

@@ -1,8 +1,8 @@
-//! Updates of the unknown parameters from the replay buffer.
+//! Updates of the filter's parameters from the replay buffer.
 //!
-//! Each update learns from one window per stream. The streams run through the buffer's blocks in random order, and each
-//! carries its belief from window to window. At the end of a block, this belief is stored in the track's next block. So
-//! every window starts from a belief that depends on the earlier frames, though gradients only reach back through the
+//! Each update learns from one window per stream. A stream reads the buffer's blocks in random order, and carries its
+//! belief from window to window. At the end of a block, this belief is stored in the track's next block. So every
+//! window starts from a belief that depends on the earlier frames, but gradients reach back only to the start of the
 //! window.
 
 use crate::checkpoint::{check, check_counts, check_numbers};
@@ -18,11 +18,11 @@ use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Number of groups of streams, each with its own buffers: the maximum number of useful threads. Groups and the order
-/// of summation do not depend on the number of threads.
+/// Number of groups of streams. Each group has its own buffers, so more threads than groups are useless. Groups and the
+/// order of summation do not depend on the number of threads.
 const N_PARTS: usize = 8;
 
-/// Learns the parameters. Contains everything that a later update depends on, except the replay buffer.
+/// The parameters, and everything else that a later update depends on, except the replay buffer.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Optimiser {
     parameters: Parameters,
@@ -46,7 +46,7 @@ pub struct Update {
     pub rate: f64,
 }
 
-/// A position in the replay buffer, and the belief before the frame there.
+/// A stream: its position in the replay buffer, and its belief before the next frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Stream {
     block: Option<u64>,
@@ -81,8 +81,8 @@ impl Optimiser {
         }
     }
 
-    /// Resumes with the parameters and moments of another optimiser. Its streams continue if both use the same windows
-    /// and grid.
+    /// Resumes with the parameters and moments of another optimiser. Also resumes its streams, if [`Self::cut`] is the
+    /// same for both.
     ///
     /// # Errors
     /// If the saved streams are invalid.
@@ -136,11 +136,11 @@ impl Optimiser {
         self.parameters.dimensions
     }
 
-    /// Makes one update. Returns `None` if there are fewer blocks than streams, or the windows show no cell.
-    /// `sure` is the state that is observed almost surely, see `add_anchor`.
+    /// Makes one update. Returns `None` if there are fewer blocks than streams, or no cell is observed in the windows.
+    /// `sure` is the state whose observation is almost certain, see `add_anchor`.
     ///
     /// # Errors
-    /// If a number is not finite. The parameters then remain unchanged.
+    /// If a value is not finite. The parameters then remain unchanged.
     pub fn update(
         &mut self,
         replay: &mut BlockReplay,
@@ -155,7 +155,7 @@ impl Optimiser {
         self.place_streams(replay);
         let outcomes = self.run_windows(replay);
         let (log_likelihood, n_seen, mut gradient) = add_up(&outcomes, self.dimensions());
-        // Checked before such a belief is stored in the replay buffer.
+        // Checked here, before a belief with such values is stored in the replay buffer.
         if !log_likelihood.is_finite() {
             return Err(self.wrong("loss", "a NaN or infinite sum"));
         }
@@ -174,7 +174,7 @@ impl Optimiser {
         self.step(loss, &gradient).map(Some)
     }
 
-    /// Detaches the streams from their blocks, because the replay buffer was replaced.
+    /// Detaches the streams from their blocks. Call this when the replay buffer is replaced.
     pub fn leave_replay(&mut self) {
         self.lap.clear();
         self.streams
@@ -254,8 +254,9 @@ impl Optimiser {
         }
     }
 
-    /// Adds the gradient of the prior `anchor * ln P(y | x)` on a state's most likely observation from the path: "there
-    /// is a state which is observable with negligible uncertainties" (paper section III.E, remark).
+    /// Adds the gradient of the log-prior `anchor * ln P(y | x)`, where y is the most likely observation of state x
+    /// from the path. The paper assumes that "there is a state which is observable with negligible uncertainties"
+    /// (section III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
         let dimensions = self.dimensions();
         let (n_observations, n_of_matrix) = (dimensions.n_observations, dimensions.n_of_matrix());

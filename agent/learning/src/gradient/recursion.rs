@@ -1,9 +1,9 @@
-//! One stream through one window of frames: the filter's recursion forward, and its derivatives backward.
+//! The filter's recursion through one window of frames, and its derivatives by backpropagation.
 //!
 //! For each frame, the forward pass computes `p = B(y) u / (b(y)' u)` on visited cells (paper eq. 5), then
 //! `u = Phi_w(p)` (eq. 6). Its value is the log-likelihood, the sum of `ln b(y)' u` over visited cells. The backward
 //! pass runs the same steps in reverse, and stops at the window's first predictor (truncated backpropagation).
-//! Gradients are zero far from the cells that later frames visit, and only the remaining region is computed.
+//! Gradients are zero far from the cells that later frames visit, so only the remaining region is computed.
 
 use crate::gradient::convolution::Region;
 use crate::gradient::layout::Layout;
@@ -22,7 +22,7 @@ pub struct Outcome {
     pub n_seen: usize,
 }
 
-/// The recursion with its buffers. Each thread needs its own.
+/// The recursion with its buffers. Each thread needs its own recursion.
 #[derive(Debug, Clone)]
 pub struct Recursion {
     operator: Operator,
@@ -32,9 +32,9 @@ pub struct Recursion {
     /// Normalising factors of each predictor: the reciprocals of the weights' sums.
     factors: Vec<Vec<f32>>,
     seen: Vec<Visit>,
-    /// Predictors of the seen cells before their correction, S numbers for each cell.
+    /// Predictors of the seen cells before their correction, S values per cell.
     predictors: Vec<f32>,
-    /// `dL/dp` or `dL/du`.
+    /// Derivatives with respect to the belief: `dL/dp` or `dL/du`.
     by_belief: Vec<f32>,
     /// `v` in the forward pass, and `dL/dv` in the backward pass.
     by_weights: Vec<f32>,
@@ -66,18 +66,18 @@ impl Recursion {
         }
     }
 
-    /// Replaces the parameters by others with the same dimensions.
+    /// Replaces the parameters with others of the same dimensions.
     pub fn set(&mut self, tables: &Tables) {
         let n_own = tables.dimensions.n_own();
         self.operator = Operator::new(self.operator.layout, n_own, &tables.kernel);
         self.tables.clone_from(tables);
     }
 
-    /// Runs over frames from `start`, the belief `[S, H, W]` at the end of an earlier window. `None` starts from the
-    /// learned first belief. `end` receives the predictor after the last frame.
+    /// Runs through frames from `start`, the belief `[S, H, W]` at the end of an earlier window, or from the learned
+    /// first belief if `start` is `None`. Writes the predictor after the last frame to `end`.
     ///
     /// # Panics
-    /// If there are more frames than in [`Self::new`], or if cells are off the grid.
+    /// If there are more frames than [`Self::new`] allowed, or if a cell is off the grid.
     pub fn run(
         &mut self,
         start: Option<&[f32]>,
@@ -133,7 +133,7 @@ impl Recursion {
         log_likelihood
     }
 
-    /// Applies eq. 6.
+    /// Computes the predictor after a frame (eq. 6).
     #[inline(always)]
     fn predict<S: Simd>(&mut self, simd: S, frame: usize) {
         let (before, after) = self.planes.split_at_mut(frame + 1);
@@ -156,7 +156,7 @@ impl Recursion {
         }
     }
 
-    /// Applies eq. 5 backward: converts `dL/dp` of a frame's cells to `dL/du`, and restores their predictors.
+    /// Backpropagates through eq. 5: converts `dL/dp` of a frame's cells to `dL/du`, and restores their predictors.
     fn uncorrect(&mut self, frame: usize, outcome: &mut Outcome, region: &mut Region) {
         let layout = self.operator.layout;
         let (n_states, width) = (layout.n_states, layout.shape.width());
@@ -174,7 +174,7 @@ impl Recursion {
             }
             for state in 0..n_states {
                 let u = self.predictors[first + state];
-                // The 1 is the derivative of -ln(evidence) itself.
+                // The term -1 is the derivative of -ln(evidence) itself.
                 let by_joint = (self.by_belief[at(state)] - mean - 1.0) / evidence;
                 outcome.gradient[1][entry(state)] += f64::from(by_joint * u);
                 self.by_belief[at(state)] = by_joint * self.tables.likelihood[entry(state)];
@@ -184,7 +184,8 @@ impl Recursion {
         }
     }
 
-    /// Applies eqs. 2 and 3 backward, from `dL/du` of a frame to `dL/dp` of the previous frame. Returns its region.
+    /// Backpropagates through eqs. 2 and 3, from `dL/du` of a frame to `dL/dp` of the previous one. Returns the region
+    /// of `dL/dp`.
     #[inline(always)]
     fn unpredict<S: Simd>(
         &mut self,
@@ -204,7 +205,7 @@ impl Recursion {
         reached
     }
 
-    /// Adds the gradient of the first belief. All cells share the same first belief.
+    /// Adds the gradient with respect to the first belief, which all cells share.
     fn add_initial_gradient(&self, outcome: &mut Outcome) {
         let layout = self.operator.layout;
         for row in 0..layout.shape.height() {
@@ -217,7 +218,7 @@ impl Recursion {
     }
 }
 
-/// One call of [`Recursion::run`].
+/// The arguments of a call of [`Recursion::run`].
 struct Pass<'a> {
     recursion: &'a mut Recursion,
     start: Option<&'a [f32]>,
@@ -225,8 +226,8 @@ struct Pass<'a> {
     end: &'a mut [f32],
 }
 
-/// Everything is inlined, down to the innermost loop, so that it is compiled for the vectors of each kind of processor.
-/// Results may differ in the last bits between kinds of processors, but not between runs or numbers of threads.
+/// Everything is inlined, down to the innermost loop, so that it is compiled for each processor's vector instructions.
+/// Results can differ in the last bits between processor types, but not between runs or numbers of threads.
 impl WithSimd for Pass<'_> {
     type Output = Outcome;
 

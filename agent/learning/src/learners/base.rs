@@ -23,21 +23,21 @@ pub struct LearnerKind {
     pub name: &'static str,
     /// Short description of the result.
     pub about: &'static str,
-    /// Names of its kind of checkpoint: the name that it writes, then names from earlier releases.
+    /// Names of its kind of checkpoint: the name that it writes, followed by names from earlier releases.
     pub checkpoints: &'static [&'static str],
     /// Names of the values that its updates report besides loss and step size.
     pub columns: &'static [&'static str],
     /// Whether it supports only a single robot in a single world.
     pub is_single: bool,
-    /// Returns the default number of world steps of a training. 0 means until stopped.
+    /// Returns the default number of world steps of a training run. 0 means that it runs until stopped.
     pub steps: fn(&AgentConfig) -> u64,
     /// Returns the number of steps per episode on a server that `train` starts. `None` means endless episodes.
     pub episode_steps: fn(&AgentConfig) -> Option<u64>,
-    /// Returns the number of world steps that a checkpoint has learned from.
+    /// Returns the number of world steps that the learner of a checkpoint has learned from.
     pub done: fn(&Contents) -> Result<u64>,
     /// Copies the settings that a checkpoint determines to the settings of a run that resumes it.
     pub adopt: fn(&Contents, &mut AgentConfig),
-    /// Loads the values for policies from a checkpoint. Returns whether it replaced a different value.
+    /// Loads from a checkpoint the values that policies use. Returns whether it replaced a different value.
     pub read: fn(&Contents, &Device, &mut Learned) -> Result<bool>,
     /// Creates a learner, or resumes one from a checkpoint.
     pub begin: fn(Beginning<'_>) -> Result<Box<dyn Learner>>,
@@ -137,7 +137,7 @@ pub type Place = [u64; 5];
 
 /// An actor that learns from the observations of its robots.
 pub trait Learning: Actor {
-    /// Whether the next frames should show every cell, if the server permits.
+    /// Whether the next frames should show every cell, if the server permits it.
     fn wants_full_frames(&self) -> bool {
         false
     }
@@ -168,7 +168,7 @@ pub trait Learning: Actor {
 
 /// A learner that can be saved and resumed.
 pub trait Saving {
-    /// Attaches the learner to its robots, given their present observations. Returns the number of robots that continue
+    /// Attaches the learner to its robots, given their current observations. Returns the number of robots that continue
     /// from the checkpoint.
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
 
@@ -181,7 +181,7 @@ pub trait Learner: Learning + Saving {}
 
 impl<L: Learning + Saving> Learner for L {}
 
-/// Explains that a run was too short for an update. `name` is the setting of the updates per step.
+/// Explains that a run was too short for an update. `name` is the name of the setting for updates per step.
 pub(super) fn lacks_steps(name: &str, updates_per_step: f64) -> String {
     format!("too few for an update at {name} = {updates_per_step}; train for more --steps")
 }

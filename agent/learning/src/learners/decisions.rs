@@ -68,7 +68,7 @@ pub struct DecisionsLearner {
     policy: Policy,
     dqn: Dqn,
     runs: Vec<Run>,
-    /// The state of each world's run in the checkpoint, until attached.
+    /// The saved run of each world, until the learner is attached.
     saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
     /// Updates that are due but not made yet.
@@ -127,7 +127,7 @@ impl DecisionsLearner {
         let mut rng = stream(self.config.seed, Purpose::Exploration, step);
         let mut random = |below: u64| rng.next_u64() % below;
         let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
-        // A held option lasts 2.5 steps on average (with the default settings), so that fewer of them begin.
+        // Held options last 2.5 steps on average (with the default settings), so they begin with a lower probability.
         if held.n_steps == 0 && (random(1 << 24) as f32) < epsilon / 2.0 * (1 << 24) as f32 {
             held.option = random(OPTIONS.len() as u64) as usize;
             held.n_steps = 1 + random(self.config.decisions.longest_hold);
@@ -154,7 +154,7 @@ impl DecisionsLearner {
         self.runs = runs;
     }
 
-    /// Returns the present factor on the step size, which falls linearly over the steps of a training.
+    /// Returns the current factor on the step size, which falls linearly over the configured number of steps.
     fn rate_share(&self) -> f32 {
         let config = &self.config.decisions;
         let done = self.world_steps as f32 / config.steps.max(1) as f32;
@@ -276,8 +276,8 @@ impl Learning for DecisionsLearner {
         let (batch, n) = (self.dqn.settings().batch, self.dqn.n_remembered());
         if n < batch {
             return format!(
-                "an update learns from {batch} transitions, and the steps gave {n}; train for more --steps, or with a \
-                 smaller decisions.batch"
+                "an update learns from {batch} transitions, and the steps yielded {n}; train for more --steps, or with \
+                 a smaller decisions.batch"
             );
         }
         let rate = self.config.decisions.updates_per_step;

@@ -1,5 +1,5 @@
 //! Learns the filter's parameters in several worlds at once. Robots first make random moves, and then plan on the
-//! belief of the present filter.
+//! belief of the current filter.
 
 pub mod fit;
 mod saved;
@@ -35,7 +35,7 @@ pub struct FilterLearner {
     rollouts: Vec<Rollout>,
     /// The last plan of each robot, with the belief that it was based on.
     planned: Vec<(Belief, Plan)>,
-    /// The state of each robot in the checkpoint.
+    /// The saved state of each robot, by robot number.
     saved_robots: BTreeMap<u32, SavedRobot>,
     is_frozen: bool,
 }
@@ -273,7 +273,7 @@ impl Saving for FilterLearner {
         let robots = self.worlds.numbers.clone();
         let mut n_resumed = 0;
         if !SavedRobot::any_is_of(&self.saved_robots, robots.clone(), &observations) {
-            // The saved frames come from other worlds, maybe with another model.
+            // The saved frames come from other worlds, which may have another model.
             self.fit.forget();
         }
         for (robot, observation) in robots.zip(observations) {

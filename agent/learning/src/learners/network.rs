@@ -57,7 +57,7 @@ fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
     )))
 }
 
-/// Checks that the server permits the first frames that show every cell, if the settings require them.
+/// Checks that the server permits full frames, if the settings require them for the first iterations.
 fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInfo) -> Result<()> {
     let full_frames = config.autoencoder.full_frames;
     ensure!(
@@ -68,9 +68,9 @@ fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInf
     Ok(())
 }
 
-/// Checks that episodes are long enough for a window. Otherwise nothing could be learned.
+/// Checks that episodes are long enough for a window. Otherwise, nothing could be learned.
 fn check_window(config: &AgentConfig, info: &ServerInfo) -> Result<()> {
-    // Some episodes of recorded worlds may be longer than the shortest episode, which the server reports.
+    // For recorded worlds, the server reports the length of the shortest episode. Others can be longer.
     let is_cut = info.max_steps > 0 && info.recorded_world.is_none();
     let (window, n_frames) = (
         config.autoencoder.window as u64,
@@ -97,7 +97,7 @@ pub struct NetworkLearner {
     is_frozen: bool,
 }
 
-/// The action of a step, the hidden vector that it was chosen from, its value, and the path.
+/// An action, the hidden vector from which it was chosen, its value, and its path.
 struct Decision {
     input: Vec<f32>,
     action: usize,
@@ -106,7 +106,7 @@ struct Decision {
 }
 
 impl NetworkLearner {
-    /// Creates a learner that continues from some progress.
+    /// Creates a learner that continues from the given progress.
     pub fn new(progress: Progress, worlds: Worlds, config: &AgentConfig) -> Self {
         Self {
             choices: network_choices(progress.autoencoder.shape().n_states),
@@ -119,7 +119,7 @@ impl NetworkLearner {
         }
     }
 
-    /// Creates a rollout that continues from a follower, before its next correction.
+    /// Creates a rollout that continues from the autoencoder's recurrent state, before its next correction.
     fn rollout_at(&self, follower: Follower, observation: Observation) -> Rollout {
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::at(network, follower);
@@ -159,7 +159,7 @@ impl NetworkLearner {
         }
     }
 
-    /// Stores the transition of the last decision, and at the end of an episode the unfinished earlier transitions.
+    /// Stores the transition of the last decision. At the end of an episode, also stores the unfinished transitions.
     fn remember(&mut self) {
         let decision = self.decision.as_ref();
         let decision = decision.expect("invariant: a step begins with a decision");
@@ -311,8 +311,8 @@ impl Learning for NetworkLearner {
 
     fn lacks(&self, _: u64) -> String {
         format!(
-            "an update learns from a window of {} frames of one episode that see some cell twice, and there was none; \
-             train for more --steps, on longer episodes (--max-steps of the server), or with a smaller \
+            "an update learns from a window of {} frames of one episode that show some cell twice, and there was no \
+             such window; train for more --steps, on longer episodes (--max-steps of the server), or with a smaller \
              autoencoder.window",
             self.config.autoencoder.window
         )

@@ -1,7 +1,7 @@
 //! Learns the neural belief in several worlds at once, from masked frames alone (paper eqs. 8 and 11).
 //!
 //! Which cells are seen depends on behaviour, and the belief must be valid for any policy. Therefore, robots change
-//! their behaviour from time to time. At first they explore. Later, most of them plan on the present belief.
+//! their behaviour from time to time. At first they explore. Later, most of them plan on the current belief.
 
 mod behaviour;
 mod replay;
@@ -64,7 +64,7 @@ pub struct NeuralLearner {
     reward: RewardEstimate,
     replay: LessonReplay,
     runs: Vec<Run>,
-    /// The state of each robot in the checkpoint, until attached.
+    /// The saved run of each robot, until the learner is attached.
     saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
     /// Updates that are due but not made yet.
@@ -110,7 +110,7 @@ impl NeuralLearner {
         Ok(learner)
     }
 
-    /// Returns the observation with the highest estimated reward, or the last one before any reward.
+    /// Returns the observation with the highest estimated reward, or the last observation before the first reward.
     fn paying(&self) -> usize {
         let last = self.worlds.n_observations - 1;
         self.reward.target().unwrap_or(last)
@@ -147,12 +147,12 @@ impl NeuralLearner {
         })
     }
 
-    /// Returns the completed share of the training.
+    /// Returns the completed fraction of the training steps.
     fn progress(&self) -> f64 {
         self.world_steps as f64 / self.config.neural.steps.max(1) as f64
     }
 
-    /// Returns the step size, which falls linearly over the steps of a training.
+    /// Returns the step size, which falls linearly over the configured number of steps.
     fn rate(&self) -> f64 {
         let config = &self.config.neural;
         config.rate * (1.0 - self.progress()).max(config.final_rate)
@@ -176,7 +176,7 @@ impl NeuralLearner {
 }
 
 impl Run {
-    /// Restores a run from a checkpoint. The rollout has not been corrected yet.
+    /// Restores a run from a checkpoint. `rollout` must not have been corrected yet.
     fn restore(saved: SavedRun, mut rollout: Rollout) -> Result<Self> {
         saved.resume_point.restore(&mut rollout.agent)?;
         Ok(Self {
@@ -313,7 +313,7 @@ impl Saving for NeuralLearner {
             })
         });
         if saved_runs.is_empty() {
-            // The saved frames come from other worlds, maybe with another model.
+            // The saved frames come from other worlds, which may have another model.
             self.replay.forget();
             self.earned = 0.0;
         }

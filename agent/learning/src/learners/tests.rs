@@ -93,7 +93,7 @@ fn check_basis(mut learner: impl Learner, basis: BasisKind) {
 }
 
 #[test]
-fn agents_of_learners_hold_the_belief_that_settings_choose() {
+fn learners_plan_on_the_configured_belief() {
     for basis in [BasisKind::Predictor, BasisKind::Estimate] {
         let config = &config(basis);
         let learner = FilterLearner::new(dimensions(false), worlds(), config);
@@ -207,13 +207,13 @@ fn decisions_learn_from_every_step_of_an_episode() {
             let discount = if ends { 0.0 } else { discount };
             assert!((got.discount - discount).abs() < 1e-6, "{n_steps}");
         }
-        // The transitions of the last steps lead to the same state.
+        // The transitions of the last steps all lead to the same state.
         let short = &got[got.len().saturating_sub(4)..];
         assert!(short.iter().all(|it| it.next == short[0].next));
     }
 }
 
-/// A neural belief that learns at every step.
+/// A learner of a neural belief that makes one update per step.
 fn neural(
     contents: Option<&Contents>,
     filter: Option<&LearnedModel>,
@@ -233,10 +233,10 @@ fn a_neural_belief_resumes_bit_for_bit() {
         learner.attach(vec![observation(0)]).expect("possible");
         let left = learn(&mut learner, 1..12);
         let resumed = || neural(Some(&left), None, worlds()).expect("its own");
-        let mut gone_on = resumed();
-        let n_resumed = gone_on.attach(vec![observation(11)]).expect("possible");
+        let mut continued = resumed();
+        let n_resumed = continued.attach(vec![observation(11)]).expect("possible");
         assert_eq!(n_resumed, 1);
-        let contents = [&mut learner, &mut gone_on].map(|learner| learn(learner, 12..16));
+        let contents = [&mut learner, &mut continued].map(|learner| learn(learner, 12..16));
         assert!(contents[0] == contents[1] && learner.n_updates() > 11);
         let mut elsewhere = resumed();
         let n_resumed = elsewhere.attach(vec![observation(7)]).expect("possible");
@@ -245,7 +245,7 @@ fn a_neural_belief_resumes_bit_for_bit() {
 }
 
 #[test]
-fn what_does_not_fit_a_neural_belief_is_named() {
+fn errors_name_what_does_not_fit_a_neural_belief() {
     let mut learner = neural(None, None, worlds()).expect("new");
     learner.attach(vec![observation(0)]).expect("possible");
     let left = learn(&mut learner, 1..5);

@@ -1,6 +1,6 @@
 //! Reports of model updates.
 
-/// The report of an update, or of a step without one.
+/// The report of an update, or of a step without an update.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelUpdate {
     /// Number of the model's updates so far.
@@ -14,7 +14,8 @@ pub struct ModelUpdate {
 }
 
 impl ModelUpdate {
-    /// Reports no update, after `number` updates. `n_more` is the length of [`super::LearnerKind::columns`].
+    /// Creates the report of a step without an update, after `number` updates. `n_more` is the length of
+    /// [`super::LearnerKind::columns`].
     pub fn nothing(number: u64, n_more: usize) -> Self {
         Self {
             number,

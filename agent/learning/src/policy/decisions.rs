@@ -5,7 +5,7 @@ use emberwatch_belief::planning::BasisKind;
 use emberwatch_network::Dqn;
 use std::sync::Arc;
 
-/// The learned values that policies with the goal `learned` and the planner `options` use.
+/// The learned values that are used by policies with the planner `options` and the goal `learned`.
 #[derive(Debug, Clone)]
 pub struct LearnedDecisions {
     pub scorer: Arc<Dqn>,

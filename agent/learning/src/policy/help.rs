@@ -6,7 +6,7 @@ use super::planners::PLANNERS;
 use crate::beliefs::BELIEFS;
 use emberwatch_belief::planning::options::OPTIONS;
 
-/// Returns a description of each part of a policy, then the policies that have a name.
+/// Returns a description of each part of a policy, followed by the policies that have a short name.
 pub fn help() -> String {
     let goals = |goals: &'static [(Goal, &str, &str)]| {
         let goals = goals.iter();

@@ -11,7 +11,7 @@ use crate::learned::Learned;
 use emberwatch_belief::planning::options::OPTIONS;
 use emberwatch_model::Model;
 
-/// Returns the policies of the benchmark under a model, from the least to the most informed.
+/// Returns the policies of the benchmark for a model, from the least to the most informed.
 pub fn ladder(model: &Model) -> Vec<Policy> {
     use Goal::{Coverage, Exploit, ExploitOnly, Explore, Rule, State};
     let states = (0..model.n_states()).filter(|state| *state != model.target_state());
@@ -83,7 +83,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_wildfires_ladder_is_this() {
+    fn the_wildfire_ladder_has_these_policies() {
         let policies = ladder(&Model::wildfire());
         let names: Vec<&str> = policies.iter().map(|policy| &*policy.name).collect();
         let expected = "random_walk coverage shooting_explore shooting_normal shooting_latent shooting_exploit \
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn options_have_a_policy_each_on_every_belief() {
+    fn options_tables_have_one_policy_per_option() {
         let model = Model::wildfire();
         for (belief, n_chosen) in [(&KNOWN, 2), (&TRUTH, 1)] {
             let table = options_table(belief, &model);

@@ -139,22 +139,22 @@ impl Policy {
     }
 }
 
-/// Checks a policy's name while the model, whose states may be goals, is unknown.
+/// Checks a policy's name without a model. Any word is accepted as the name of a state.
 ///
 /// # Errors
-/// Like [`Policy::named`], if the name is invalid under every model.
+/// If the name is invalid under every model. The error lists the valid names.
 pub fn check_name(name: &str) -> Result<()> {
-    // Any word may be the name of a state.
+    // Any word can be the name of a state.
     let is_word = |state: &str| (!state.is_empty()).then_some(0);
     parse(name, &is_word, "a state of the model").map(drop)
 }
 
-/// Returns the planner of the policy with a name. `None` for an unknown name, such as an external agent's.
+/// Returns the planner of the policy with this name. `None` if the name is unknown, as for an external agent's policy.
 pub fn planner_of(name: &str) -> Option<&'static PlannerKind> {
     parse(name, &|_| Some(0), "").ok().map(|parts| parts.1)
 }
 
-/// Returns the belief of the policy with a name. `None` for an unknown name, such as an external agent's.
+/// Returns the belief of the policy with this name. `None` if the name is unknown, as for an external agent's policy.
 pub fn belief_of(name: &str) -> Option<&'static BeliefKind> {
     parse(name, &|_| Some(0), "").ok().map(|parts| parts.0)
 }
@@ -193,7 +193,8 @@ fn former(name: &str) -> Option<String> {
 
 type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
 
-/// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the names for errors.
+/// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the states for
+/// errors.
 fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Result<Parts> {
     let mut table = NAMED.iter();
     let parts = match table.find(|(known, _)| *known == name) {
@@ -234,7 +235,7 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
     Ok((belief, planner, goal))
 }
 
-/// Returns the goals of a planner other than `options`, without the states of the model.
+/// Returns the goals that planners other than `options` accept, without the states of the model.
 fn goals(belief: &BeliefKind) -> impl Iterator<Item = &'static (Goal, &'static str, &'static str)> {
     let decides = belief.decides();
     let goals = GOALS.iter();
@@ -290,7 +291,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_name_is_of_its_parts_and_of_no_other_policy() {
+    fn each_short_name_stands_for_its_parts() {
         let model = Model::wildfire();
         for &(name, parts) in NAMED {
             let policy = Policy::named(name, &model).expect("a policy");
@@ -307,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn each_combination_of_parts_is_a_policy_by_its_name() {
+    fn each_combination_of_parts_is_found_by_its_name() {
         let model = Model::wildfire();
         let mut n_policies = 0;
         for &belief in BELIEFS {
@@ -331,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_earlier_releases_are_those_of_the_same_policies() {
+    fn legacy_names_stand_for_the_same_policies() {
         let model = Model::wildfire();
         for (name, expected) in [
             ("beam_explore", "known/beam/explore"),
@@ -367,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_with_a_name_is_told() {
+    fn errors_explain_what_is_wrong_with_a_name() {
         let model = Model::wildfire();
         for (name, words) in [
             ("", "expected one of random_walk, coverage, "),

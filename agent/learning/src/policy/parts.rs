@@ -41,7 +41,8 @@ pub enum Goal {
 }
 
 impl Policy {
-    /// Returns the policy of learners: beam search for the state with the highest reward, named by its parts.
+    /// Returns the policy that learners act with: beam search for the state with the highest reward, named by its
+    /// parts.
     pub fn exploiting(belief: &'static BeliefKind) -> Self {
         Self {
             name: format!("{}/beam/exploit", belief.name),
@@ -56,7 +57,7 @@ impl Policy {
         self.goal == Goal::Learned && *self.planner == BY_OPTIONS
     }
 
-    /// Whether it needs a result of `train`.
+    /// Whether the policy needs a checkpoint from `train`.
     pub fn needs_checkpoint(&self) -> bool {
         self.goal == Goal::Learned || self.belief.learned_by.is_some()
     }
@@ -77,7 +78,7 @@ impl Policy {
     /// Returns the decisions that were learned on the policy's belief.
     ///
     /// # Errors
-    /// If there are none, or they were learned on another belief.
+    /// If there are no learned decisions, or they were learned on another belief.
     pub fn decisions<'a>(&self, learned: &'a Learned) -> Result<&'a LearnedDecisions> {
         let decisions = learned.get::<LearnedDecisions>();
         let decisions =
@@ -115,8 +116,8 @@ impl Policy {
     }
 }
 
-/// Returns the choices of the DQN of Algorithm 1 (paper section IV, the actions `a_k`): the probability of each state,
-/// then the belief's entropy.
+/// Returns the policies among which the DQN of Algorithm 1 chooses (paper section IV, the actions `a_k`): one for the
+/// probability of each state, then one for the belief's entropy.
 pub fn network_choices(n_states: usize) -> Vec<Policy> {
     let states = (0..n_states).map(Goal::State);
     let goals = states.chain([Goal::Explore]);
@@ -141,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn the_default_bonuses_are_the_authors_and_a_small_one() {
+    fn default_bonuses_are_the_authors_and_small_for_beam() {
         let config = AgentConfig::default();
         let [fire, entropy] = [Target::State(2), Target::Entropy].map(Objective::paper);
         assert_eq!(objective("shooting_exploit", &config), fire);

@@ -1,4 +1,4 @@
-//! One agent in one world: plan, correct, predict. Pure: communication is elsewhere.
+//! One agent in one world: plan, correct, predict. It does not communicate.
 
 use crate::config::AgentConfig;
 use crate::parallel::in_parallel;
@@ -19,7 +19,7 @@ use emberwatch_network::Dqn;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The aim that observers see for a random path.
+/// The aim that is shown to observers for a random path.
 const RANDOM_MOVES: &str = "random moves";
 
 const NO_TRUTH: &str = "the policy needs the truth channel: start the server with --publish-truth";
@@ -35,7 +35,7 @@ pub struct Agent {
     planner: Box<dyn Planner + Send>,
     options: OptionPlanner,
     pub memory: Memory,
-    /// The belief's index of the state with the highest reward.
+    /// The index, in the belief, of the state with the highest reward.
     target: usize,
     /// Short description of the last path's purpose.
     aim: String,
@@ -73,9 +73,9 @@ pub struct Setup {
     pub beam_width: usize,
     pub state_names: Vec<String>,
     pub n_moves: usize,
-    /// Seed of the planner's random numbers, from the agent's seed and the world's seed.
+    /// Seed of the planner's random numbers, derived from the agent's seed and the world's seed.
     pub seed: u64,
-    /// The belief's index of the state with the highest reward.
+    /// The index, in the belief, of the state with the highest reward.
     pub target: usize,
     /// The cells that robots may fly over, and the range of their sensors.
     pub airspace: Airspace,
@@ -118,7 +118,7 @@ impl Agent {
         &self.airspace
     }
 
-    /// Returns the belief's index of the state with the highest reward.
+    /// Returns the index, in the belief, of the state with the highest reward.
     pub fn target(&self) -> usize {
         self.target
     }
@@ -133,7 +133,7 @@ impl Agent {
         self.plan_for(objective, robots, step)
     }
 
-    /// Plans paths like [`Self::plan`], for the given objective instead of the policy's.
+    /// Plans paths as [`Self::plan`] does, but for the given objective instead of the policy's.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
         let aim = if !self.policy.planner.has_goal {
             RANDOM_MOVES.into()
@@ -144,7 +144,7 @@ impl Agent {
         self.plan_values(&values, &aim, robots, step)
     }
 
-    /// Plans paths like [`Self::plan`], for the given values of cells. `aim` describes the values to observers.
+    /// Plans paths as [`Self::plan`] does, but for the given values of cells. `aim` describes the values to observers.
     pub fn plan_values(
         &mut self,
         values: &CellValues,
@@ -157,7 +157,7 @@ impl Agent {
         plan_team(planner, values, robots, self.n_moves, random, ROUNDS)
     }
 
-    /// Plans paths like [`Self::plan`], on the given belief instead of the agent's.
+    /// Plans paths as [`Self::plan`] does, but on the given belief instead of the agent's.
     #[cfg(test)]
     pub(crate) fn plan_on(&mut self, belief: &Belief, robots: &[Cell], step: u64) -> Vec<Plan> {
         let own = self.estimate.replace(belief.clone());
@@ -166,7 +166,7 @@ impl Agent {
         plans
     }
 
-    /// Plans all options from a robot's cell. Each proposal has the features of its option.
+    /// Plans all options from a robot's cell. Each proposal contains the path and the features of one option.
     pub fn propose(&mut self, robot: Cell) -> Vec<Proposal> {
         self.options.propose(&self.outlook(), robot)
     }
@@ -177,7 +177,7 @@ impl Agent {
         proposal.plan
     }
 
-    /// Computes the value that each part of the grid promises to a robot.
+    /// Computes the layers of cell values from which options are planned.
     fn outlook(&self) -> Outlook {
         let (belief, air) = (self.basis_belief(), &self.airspace);
         Outlook::new(belief, air, self.target, &self.memory, self.n_moves)
@@ -227,7 +227,7 @@ impl Agent {
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
 
-    /// Scores the belief's prediction of a frame. `None` if the estimator does not predict frames.
+    /// Scores the belief's prediction of a frame. Returns `None` if the estimator does not predict frames.
     pub fn score(&self, frame: &Frame) -> Option<Score> {
         let likelihood = self.estimator.likelihood()?;
         Some(score(self.estimator.belief(), &likelihood, frame))
@@ -256,7 +256,7 @@ impl Agent {
         Self::predict_all([self]);
     }
 
-    /// Predicts the beliefs of several agents, like [`Self::predict`].
+    /// Predicts the beliefs of several agents, as [`Self::predict`] does for one.
     pub fn predict_all<'a>(agents: impl IntoIterator<Item = &'a mut Self>) {
         let (mut together, mut alone) = (Vec::new(), Vec::new());
         for agent in agents {
@@ -283,7 +283,7 @@ impl Agent {
         }
     }
 
-    /// Passes the states X_{k+1}, which the next path will meet, to an oracle. Other estimators ignore them.
+    /// Passes the states X_{k+1}, which the next path will encounter, to an oracle. Other estimators ignore them.
     pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
         self.estimator.told().map_or(Ok(()), |told| told.tell(next))
     }
@@ -301,19 +301,21 @@ impl Agent {
         &mut *self.estimator
     }
 
-    /// Names the format of [`Self::handover`]. `None` if no other agent can resume from this agent.
+    /// Returns the name of the format of [`Self::handover`]. `None` if no other agent can resume from this agent.
     pub fn handover_kind(&self) -> Option<String> {
         let kind = self.estimator.handover()?.kind();
         Some(handover_of(&kind))
     }
 
-    /// Encodes the agent's knowledge of its world before X_{k+1}: the estimator's state, and the agent's memory.
+    /// Encodes the agent's knowledge of its world before the frame of X_{k+1}: the estimator's state, and the agent's
+    /// memory.
     pub fn handover(&self) -> Option<Vec<u8>> {
         let estimator = self.estimator.handover()?.to_bytes();
         Some([estimator, self.memory.to_bytes()].concat())
     }
 
-    /// Resumes from the bytes of an agent of the same kind. If they do not fit, returns false and changes nothing.
+    /// Resumes from the handover bytes of an agent of the same kind. If they do not fit, returns false and changes
+    /// nothing.
     pub fn take_over(&mut self, bytes: &[u8]) -> bool {
         let shape = self.belief().shape();
         let Some(n_bytes) = bytes.len().checked_sub(Memory::n_bytes(shape)) else {
@@ -331,7 +333,7 @@ impl Agent {
         is_taken
     }
 
-    /// Replaces the estimator, for example by one with newer parameters.
+    /// Replaces the estimator, for example with one that has newer parameters.
     pub fn set_estimator(&mut self, estimator: Box<dyn Estimator>) {
         self.estimator = estimator;
     }
@@ -341,7 +343,7 @@ impl Agent {
         self.estimate.as_ref()
     }
 
-    /// Returns the message for observers. `planning` is the duration of the last planning.
+    /// Returns the message for observers. `planning` is the time that the last planning took.
     pub fn intent(&self, planning: Duration) -> Intent {
         Intent {
             policy: self.policy.name.clone(),
@@ -357,7 +359,7 @@ impl Agent {
     }
 }
 
-/// Names the format of an agent's handover, given the format of its estimator's handover.
+/// Returns the name of the format of an agent's handover, given the format of its estimator's handover.
 pub fn handover_of(kind: &str) -> String {
     format!("{kind}; freshness [H, W] as f32, rewards, paths")
 }

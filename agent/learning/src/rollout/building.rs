@@ -1,4 +1,4 @@
-//! Construction of a policy's agent from its belief, its planner and its chooser.
+//! Builds a policy's agent from its belief, its planner and its chooser.
 
 use super::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use crate::beliefs::autoencoder::AutoencoderModel;
@@ -10,7 +10,7 @@ use anyhow::{Context, Result};
 use emberwatch_belief::planning::{BasisKind, Objective};
 use std::sync::Arc;
 
-/// Checks that a policy can act in worlds of a form, given the checkpoints.
+/// Checks that a policy can act in worlds of the given form with the given checkpoints.
 ///
 /// # Errors
 /// If the checkpoints lack something that the policy uses, or were trained in worlds of another form.
@@ -19,10 +19,10 @@ pub fn check(policy: &Policy, learned: &Learned, world: &WorldForm) -> Result<()
     policy.belief.check(learned, world)
 }
 
-/// Builds a policy's agent before its first frame. `seed` is the planner's, see [`AgentConfig::planner_seed`].
+/// Builds a policy's agent before its first frame. `seed` is the planner's seed, see [`AgentConfig::planner_seed`].
 ///
 /// # Errors
-/// Like [`check`], or if the computation of the network fails.
+/// If [`check`] fails, or the network's computation fails.
 pub fn agent(
     policy: &Policy,
     config: &AgentConfig,
@@ -52,8 +52,9 @@ pub fn agent(
     Ok(Agent::new(estimator, policy, config, setup))
 }
 
-/// Returns the kind of belief that a policy plans on: the setting, or for a DQN the kind that it was trained with, as
-/// its values refer to such paths. A clairvoyant always plans on the next states.
+/// Returns the belief that a policy plans on, the estimate or the predictor. A DQN keeps the one that it was trained
+/// with, because its values refer to paths planned on it. A clairvoyant always plans on the next states. Otherwise, the
+/// settings decide.
 fn basis(policy: &Policy, config: &AgentConfig, learned: &Learned) -> Result<BasisKind> {
     Ok(match policy.goal {
         Goal::Learned if policy.chooses_options() => policy.decisions(learned)?.basis,
@@ -87,7 +88,7 @@ fn network(learned: &Learned) -> Result<Arc<AutoencoderModel>> {
     network.context("checkpoint: expected a learned autoencoder, got none")
 }
 
-/// Returns the function that chooses an objective by the DQN that was trained with an autoencoder.
+/// Returns a function that chooses an objective with the DQN of Algorithm 1, which was trained with an autoencoder.
 fn decider(config: &AgentConfig, network: Arc<AutoencoderModel>) -> Decider {
     let choices = network_choices(network.autoencoder.shape().n_states).into_iter();
     let objectives = choices.map(|choice| choice.objective(network.target, config));

@@ -1,4 +1,4 @@
-//! The DQN: action values, and updates.
+//! The DQN: its settings, action values and updates.
 
 use super::track::{Track, Transition};
 use crate::adam::{Adam, AdamSettings};
@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::fmt;
 
-/// Settings of the learner, as in files. Files do not contain the optimiser's settings.
+/// Settings of a DQN, as stored in files. Files do not contain the optimiser's settings.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DqnSettings {
     /// Capacity of the replay buffer, in transitions.
@@ -25,7 +25,7 @@ pub struct DqnSettings {
     pub gamma: f32,
     /// Number of steps per transition. Transitions at the end of an episode span fewer: see [`Track`].
     pub n_step: usize,
-    /// Weight of the network in the update of its target network.
+    /// Weight of the network's variables in each update of the target network.
     pub tau: f32,
     /// Probability of a random action at the first step.
     pub epsilon: f32,
@@ -37,9 +37,9 @@ pub struct DqnSettings {
     pub double: bool,
     /// Whether to use the Huber loss, which is linear for errors above 1, instead of the squared error.
     pub huber: bool,
-    /// Width of both hidden layers.
+    /// Number of units in each of the two hidden layers.
     pub width: usize,
-    /// Settings of the optimiser. The default is the authors'.
+    /// Settings of the optimiser. The default settings are the authors'.
     #[serde(skip, default = "adam")]
     pub adam: AdamSettings,
 }
@@ -95,7 +95,7 @@ pub struct DqnShape {
 }
 
 impl DqnShape {
-    /// Scores all actions from one input vector.
+    /// Returns the shape of a DQN that scores all actions from one input vector.
     pub fn of_actions(n_inputs: usize, n_actions: usize) -> Self {
         Self {
             n_inputs,
@@ -104,7 +104,7 @@ impl DqnShape {
         }
     }
 
-    /// Scores each candidate from its own features.
+    /// Returns the shape of a DQN that scores each candidate from the candidate's features.
     pub const fn of_candidates(n_inputs: usize, n_candidates: usize) -> Self {
         Self {
             n_inputs,
@@ -113,7 +113,7 @@ impl DqnShape {
         }
     }
 
-    /// Returns the number of inputs of a decision.
+    /// Returns the number of input values per decision, over all candidates.
     pub fn n_numbers(&self) -> usize {
         self.n_inputs * self.n_candidates
     }
@@ -151,7 +151,7 @@ struct Batch {
 }
 
 impl Perceptron {
-    /// Creates the layers, with the names of `torch.nn.Sequential`.
+    /// Creates the layers, named as in `torch.nn.Sequential`.
     fn new(vb: &VarBuilder<'_>, sizes: [usize; 4]) -> CandleResult<Self> {
         let layers = sizes.windows(2).enumerate().map(|(index, sizes)| {
             let (vb, init) = (vb.pp(2 * index), uniform_init(sizes[0]));
@@ -181,7 +181,7 @@ impl Dqn {
             shape.n_outputs,
         ];
         let perceptron = |vb: VarBuilder<'_>| Perceptron::new(&vb, sizes);
-        // Initial values depend only on the seed and the names.
+        // Initial values depend only on the seed and the names, so both networks start equal.
         let made = || on_cpu(build(seed, DType::F32, &Device::Cpu, perceptron));
         let ((network, variables), (target, target_variables)) = (made(), made());
         Self {
@@ -219,7 +219,7 @@ impl Dqn {
     /// Computes the value of each choice of a decision, `Q(h, .)`.
     ///
     /// # Panics
-    /// If `input` has another length.
+    /// If `input` has the wrong length.
     pub fn values(&self, input: &[f32]) -> Vec<f32> {
         assert_eq!(
             input.len(),
@@ -247,7 +247,8 @@ impl Dqn {
         (0..values.len()).fold(0, larger)
     }
 
-    /// Returns the best choice, or a random one with the probability of this step.
+    /// Returns a random choice with the probability that [`DqnSettings::epsilon_at`] returns, and otherwise the best
+    /// choice.
     pub fn act(&self, input: &[f32], step: u64) -> usize {
         let mut rng = stream(self.seed, Purpose::Exploration, step);
         if uniform(&mut rng) < self.settings.epsilon_at(step) {
@@ -263,8 +264,8 @@ impl Dqn {
         Track::new(self.settings.n_step)
     }
 
-    /// Returns the discount of the value after one step: 0 if the episode terminated, otherwise gamma. The value after
-    /// a truncated episode counts, because the world continues.
+    /// Returns the discount of the next state's value: 0 if the episode terminated, otherwise gamma. The value after a
+    /// truncated episode counts, because the world continues.
     pub fn discount(&self, is_terminated: bool) -> f32 {
         if is_terminated {
             0.0
@@ -276,7 +277,7 @@ impl Dqn {
     /// Adds a transition to the replay buffer. Removes the oldest if the buffer is full.
     ///
     /// # Panics
-    /// If the transition has another number of inputs or an invalid action.
+    /// If the transition has the wrong number of inputs or an invalid action.
     pub fn remember(&mut self, transition: Transition) {
         assert!(
             self.fits(&transition),
@@ -292,7 +293,7 @@ impl Dqn {
     /// or `None` if there are fewer transitions than a batch.
     ///
     /// # Errors
-    /// [`NetworkError`] if a number is not finite. An error changes nothing.
+    /// [`NetworkError`] if a value is not finite. The DQN is then unchanged.
     pub fn update(&mut self) -> Result<Option<f32>, NetworkError> {
         if self.memory.len() < self.settings.batch.max(1) {
             return Ok(None);
@@ -304,10 +305,10 @@ impl Dqn {
         self.learn_batch(&batch).map(Some)
     }
 
-    /// Like [`Self::update`], on a given batch (eqs. 19 and 21).
+    /// Performs an update as [`Self::update`] does, but on a given batch (eqs. 19 and 21).
     ///
     /// # Errors
-    /// [`NetworkError`] if a number is not finite. An error changes nothing.
+    /// [`NetworkError`] if a value is not finite. The DQN is then unchanged.
     pub fn learn(&mut self, batch: &[Transition]) -> Result<f32, NetworkError> {
         let batch = Batch::new(batch.iter(), self.shape)?;
         self.learn_batch(&batch)
@@ -350,7 +351,7 @@ impl Dqn {
         }
     }
 
-    /// Returns whether a transition fits the DQN. Its input is from one candidate, and its next input from all
+    /// Returns whether a transition fits the DQN. Its input must belong to one candidate, and its next input to all
     /// candidates.
     pub(super) fn fits(&self, transition: &Transition) -> bool {
         transition.input.len() == self.shape.n_inputs
@@ -406,7 +407,7 @@ fn huber(got: &Tensor, goal: &Tensor) -> CandleResult<Tensor> {
     (&near * (&size - (&near * 0.5)?)?)?.mean_all()
 }
 
-/// Unwraps the result of an operation on tensors of known sizes on the CPU, which cannot fail.
+/// Unwraps the result of an operation that cannot fail, because it runs on the CPU and the sizes of tensors are known.
 pub(super) fn on_cpu<T>(result: CandleResult<T>) -> T {
     result.expect("invariant: sizes fit, and the CPU does not fail")
 }

@@ -31,7 +31,7 @@ impl Dqn {
         ]
     }
 
-    /// Returns the other state that a resumed run needs.
+    /// Returns the rest of the state that a resumed run needs.
     pub fn saved(&self) -> SavedDqn {
         SavedDqn {
             n_updates: self.n_updates(),
@@ -39,12 +39,13 @@ impl Dqn {
         }
     }
 
-    /// Loads the results of [`Self::named_tensors`] and [`Self::saved`] of a DQN with the same inputs and actions.
-    /// Afterwards it learns exactly as the saved DQN would have learned, bit for bit. If the saved replay buffer
-    /// exceeds the capacity, it keeps the latest transitions. `find` returns the numbers for a name and a shape.
+    /// Loads the state that [`Self::named_tensors`] and [`Self::saved`] returned for a DQN with the same inputs and
+    /// actions. This DQN then learns exactly as the saved one would have, bit for bit. If the saved replay buffer
+    /// exceeds the capacity, only the latest transitions are kept. `find` returns the values of a tensor with a given
+    /// name and shape.
     ///
     /// # Errors
-    /// If `find` fails, or a transition does not fit the DQN. An error changes nothing.
+    /// If `find` fails, or a transition does not fit the DQN. The DQN is then unchanged.
     pub fn load<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
@@ -60,8 +61,8 @@ impl Dqn {
         Ok(())
     }
 
-    /// Resumes the saved track of an episode. If the track has another [`n_step`](super::DqnSettings::n_step), returns
-    /// an empty track.
+    /// Resumes the saved track of an episode. If the track has a different [`n_step`](super::DqnSettings::n_step),
+    /// returns an empty track.
     ///
     /// # Errors
     /// If a step does not fit the DQN.

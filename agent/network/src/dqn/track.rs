@@ -18,7 +18,7 @@ pub struct Transition {
     pub discount: f32,
 }
 
-/// The latest steps of one episode, with incomplete n-step returns (Sutton and Barto, section 7.1).
+/// The latest steps of one episode, whose n-step returns are still incomplete (Sutton and Barto, section 7.1).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Track {
     pub(super) n_step: usize,
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_become_one_with_the_discounted_reward() {
+    fn steps_combine_into_one_discounted_transition() {
         let mut track = Track::new(1);
         assert_eq!(track.add(step(3)), Some(step(3)));
         assert_eq!(track.end(), []);
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn each_step_of_the_shortest_episode_is_one_transition() {
+    fn a_short_episode_has_one_transition_per_step() {
         // The returns are 4 + 5 / 2 + 6 / 4, 5 + 6 / 2 and 6. All end at the last state, 7.
         let last = [
             over(4, 8.0, 3, 0.125),
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_follows_the_end_of_an_episode_that_terminated() {
+    fn a_terminated_episode_has_no_value_after_its_end() {
         let mut track = Track::new(2);
         let last = Transition {
             discount: 0.0,
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn discounts_are_powers_to_the_bit() {
+    fn discounts_are_exact_powers() {
         for (gamma, n) in [(0.97_f32, 4), (0.99, 1), (0.99, 3), (0.9, 8), (0.5, 20)] {
             let mut track = Track::new(n);
             let step = Transition {

@@ -1,6 +1,6 @@
 //! Dropout, normalisation and ReLU between two convolutions, forward and backward.
 //!
-//! One step precedes the normalisation and one follows it. One of the two steps is ReLU, the other does nothing
+//! One step precedes the normalisation and one follows it. One of the two steps is ReLU, and the other does nothing
 //! ([`Order`]).
 //!
 //! Only the planes of channels that dropout keeps are stored. Dropout sets a dropped channel to zero, which
@@ -118,7 +118,7 @@ impl Activation {
     }
 
     /// Computes the gradient `dy` of the normalisation's output from the gradient `dx` of the activation, and adds it
-    /// to the sums from which the normalisation's gradient follows.
+    /// to the sums from which the normalisation's gradient is computed.
     #[inline(always)]
     pub(super) fn backward(
         &self,

@@ -6,7 +6,8 @@
 use super::cpu::{Frames, frames, total};
 use crate::window::Window;
 
-/// Added inside logarithms, as in the authors' code. It keeps the loss finite if a probability is rounded to 0 or 1.
+/// A constant that is added inside logarithms, as in the authors' code. It keeps the loss finite if a probability is
+/// rounded to 0 or 1.
 pub(crate) const LOG_FLOOR: f64 = 1e-10;
 
 /// The mean loss over a window's targets, in nats per cell, and its gradients.
@@ -85,10 +86,10 @@ impl<'a> CellLoss<'a> {
         }
     }
 
-    /// Adds the loss of a cell where `value` was observed, and replaces its logits by their gradients.
+    /// Adds the loss of a cell where `value` was observed, and replaces the cell's logits with their gradients.
     ///
-    /// The loss is minus the logarithm of a product. The product underflows only if `q_y` does: the `q` sum to one, so
-    /// at most one other factor `1 - q_a` is small, and it is zero or at least 6e-8.
+    /// The loss is minus the logarithm of a product. The product underflows only if `q_y` does: all `q` sum to one, so
+    /// at most one other factor `1 - q_a` is small, and this factor is zero or at least 6e-8.
     #[inline(always)]
     fn add(&mut self, logits: &mut [f32], value: u8) {
         let largest = logits.iter().copied().fold(f32::MIN, f32::max);
@@ -129,7 +130,7 @@ impl<'a> CellLoss<'a> {
 }
 
 /// Returns the probability of a channel's binary outcome: `q` if the channel was observed, otherwise `1 - q`. Rounding
-/// may make `q` larger than 1.
+/// can make `q` larger than 1.
 #[inline(always)]
 fn term(q: f32, hit: bool) -> f32 {
     LOG_FLOOR as f32 + if hit { q } else { (1.0 - q).max(0.0) }

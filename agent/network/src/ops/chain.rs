@@ -16,7 +16,8 @@ pub(crate) struct Chain {
 }
 
 impl Chain {
-    /// Runs the layers on maps `[frames, channels, rows, cols]` and their dropout mask. Returns the last result.
+    /// Runs the layers on maps `[frames, channels, rows, cols]` and their dropout mask. Returns the output of the last
+    /// layer.
     ///
     /// `moments(layer, moments of the window)` returns the moments that the layer's normalisation uses.
     pub(crate) fn forward(
@@ -55,8 +56,8 @@ impl Chain {
         Ok((chain, z))
     }
 
-    /// Computes the gradients of all layers from the gradient of the last result, in the order of [`Layer::tensors`].
-    /// If the first layer has a normalisation, the gradient of the maps precedes them.
+    /// Computes the gradients of all layers from the gradient of the last layer's output, in the order of
+    /// [`Layer::tensors`]. If the first layer has a normalisation, the gradient of the input maps comes first.
     pub(crate) fn backward(&self, last: Frames) -> Result<Vec<f32>> {
         let (mut parts, mut gradient) = (Vec::new(), ResultGradient::Given(last));
         for (stage, z) in self.stages.iter().zip(&self.z).rev() {

@@ -6,11 +6,11 @@
 //! `[kernel rows, kernel cols, large channels, small channels]`.
 //!
 //! All three are matrix products without an im2col copy ([`super::product`]). Each plane is copied once into a
-//! zero-padded buffer, where the cells that one tap of the kernel reads for all output cells are one contiguous run.
-//! With a stride `s`, the large plane is split into `s * s` parts by the remainders of row and column, so that runs
-//! stay contiguous.
+//! zero-padded buffer. There, the cells that one tap of the kernel reads for all output cells are stored contiguously,
+//! as one *run*. With a stride `s`, the large plane is split into `s * s` parts by the remainders of row and column
+//! modulo `s`, so that runs stay contiguous.
 //!
-//! Channels are passed as lists: channels dropped by dropout are neither read nor computed.
+//! Channels are passed as lists, so that channels removed by dropout are neither read nor computed.
 
 use super::cpu::add;
 use super::product::{add_product, left_factor, product, right_factor, steps};
@@ -40,8 +40,9 @@ pub(crate) struct Conv {
     part: [usize; 2],
     /// Number of rows of zeros above a small plane, and of columns of zeros left of it.
     margin: [usize; 2],
-    /// Number of columns and of cells of a small plane with its margins.
+    /// Number of columns of a small plane with its margins.
     framed_cols: usize,
+    /// Number of cells of a small plane with its margins.
     framed: usize,
 }
 
@@ -50,7 +51,7 @@ pub(crate) struct Conv {
 struct Tap {
     /// Index of the part that the tap reads.
     part: usize,
-    /// Offset of its run in that part, in rows and columns.
+    /// Offset of the tap's run in that part, in rows and columns.
     shift: [usize; 2],
 }
 
@@ -60,7 +61,7 @@ pub(crate) struct Buffers {
     small: Vec<f32>,
     /// The small map with channels last, `[cells, channels]`.
     channels_last: Vec<f32>,
-    /// Results with the padding between rows.
+    /// Results, with padding between their rows.
     wide: Vec<f32>,
 }
 
@@ -136,7 +137,7 @@ impl Conv {
         }
     }
 
-    /// Copies a large plane to the buffer with an index. The zeros around it stay.
+    /// Copies a large plane to position `index` of the buffer. The zeros around it stay in place.
     #[inline(always)]
     pub(crate) fn put_large(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         let Sizes {
@@ -171,7 +172,7 @@ impl Conv {
         [self.sizes.large[0], self.sizes.small[0]].map(|n| (0..n).collect())
     }
 
-    /// Copies a small plane to the buffer with an index. The zeros around it stay.
+    /// Copies a small plane to position `index` of the buffer. The zeros around it stay in place.
     #[inline(always)]
     pub(crate) fn put_small(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         let cols = self.sizes.small[2];
@@ -183,7 +184,7 @@ impl Conv {
     }
 
     /// Copies a small plane, transposed to channels last, for [`Self::add_weight_gradient`]. Other channels keep the
-    /// values of earlier frames until [`Self::clear_transposed`].
+    /// values of earlier frames until [`Self::clear_transposed`] is called.
     #[inline(always)]
     pub(crate) fn transpose_small(&self, buffers: &mut Buffers, channel: usize, plane: &[f32]) {
         let to = buffers.channels_last[channel..]
@@ -192,7 +193,7 @@ impl Conv {
         to.zip(plane).for_each(|(to, from)| *to = *from);
     }
 
-    /// Copies all planes of a small map like [`Self::transpose_small`].
+    /// Copies all planes of a small map as [`Self::transpose_small`] does.
     #[inline(always)]
     pub(crate) fn transpose_all_small(&self, buffers: &mut Buffers, map: &[f32]) {
         /// Number of cells per block. A block fits into the first-level cache.
@@ -330,8 +331,8 @@ impl Conv {
         }
     }
 
-    /// Returns the first row (or column) inside the large plane among the rows with the given remainder. Also returns
-    /// the number of such rows inside.
+    /// Finds the rows (or columns) with the given remainder that lie inside the large plane. Returns the first of them
+    /// and their number.
     fn inside(&self, remainder: usize, side: usize) -> (usize, usize) {
         let Sizes {
             stride, padding, ..
@@ -341,8 +342,8 @@ impl Conv {
         (first, end.saturating_sub(first))
     }
 
-    /// Adds the gradient of the weights to `to`. It reads the given large channels and the transposed small map in
-    /// `buffers`.
+    /// Adds the gradient of the weights to `to`. The gradient is computed from the given large channels and the
+    /// transposed small map in `buffers`.
     #[inline(always)]
     pub(crate) fn add_weight_gradient(&self, buffers: &Buffers, large: &[usize], to: &mut [f32]) {
         let ([n, rows, cols], width) = (self.sizes.small, self.part[1]);
@@ -372,7 +373,7 @@ impl Conv {
     }
 }
 
-/// Copies every `n`th number of `from` to consecutive numbers of `to`.
+/// Copies every `n`th element of `from` to consecutive elements of `to`.
 #[inline(always)]
 fn every(n: usize, from: &[f32], to: &mut [f32]) {
     #[inline(always)]
@@ -389,7 +390,7 @@ fn every(n: usize, from: &[f32], to: &mut [f32]) {
     }
 }
 
-/// Adds consecutive numbers to every `n`th number of `to`.
+/// Adds consecutive numbers to every `n`th element of `to`.
 #[inline(always)]
 fn add_to_every(n: usize, numbers: &[f32], to: &mut [f32]) {
     match n {

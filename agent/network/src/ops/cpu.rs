@@ -10,7 +10,7 @@ use std::sync::Mutex;
 /// in a fixed order, so the result does not depend on the number of threads.
 const N_CHUNKS: usize = 32;
 
-/// Returns the numbers of a contiguous tensor on the CPU. The tensor is locked until the result is dropped.
+/// Returns the values of a contiguous tensor on the CPU. The tensor is locked until the result is dropped.
 pub(crate) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_> {
     let (storage, layout) = tensor.storage_and_layout();
     let range = match (&*storage, layout.contiguous_offsets()) {
@@ -20,7 +20,7 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_
     Ok(Numbers { storage, range })
 }
 
-/// Like [`numbers`], for the arguments of a candle operator.
+/// Returns values as [`numbers`] does, but from an argument of a candle operator.
 pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     match (storage, layout.contiguous_offsets()) {
         (CpuStorage::F32(numbers), Some((start, end))) => Ok(&numbers[start..end]),
@@ -45,7 +45,7 @@ impl<G: Deref<Target = Storage>> Deref for Numbers<G> {
 }
 
 /// Creates a tensor from numbers that were computed from the tensors `from`. `backward` converts the gradient of the
-/// result to the gradients of these tensors, concatenated in their order.
+/// result into the concatenated gradients of these tensors, in the same order.
 pub(crate) fn derived(
     from: &[&Tensor],
     shape: impl Into<Shape>,
@@ -63,7 +63,7 @@ pub(crate) fn derived(
 
 struct Derived<F> {
     shape: Shape,
-    /// The numbers, until the forward pass moves them into the tensor.
+    /// The tensor's values, until the forward pass moves them into the tensor.
     numbers: Mutex<Vec<f32>>,
     backward: F,
 }
@@ -89,7 +89,7 @@ impl<F: Fn(&[f32]) -> Vec<f32> + Send + Sync> CustomOp1 for Derived<F> {
     }
 }
 
-/// The numbers of all frames, in chunks of consecutive frames.
+/// The values of all frames, in chunks of consecutive frames.
 pub(crate) struct Frames {
     chunks: Vec<Chunk>,
     /// Number of frames per chunk.
@@ -98,12 +98,12 @@ pub(crate) struct Frames {
 
 struct Chunk {
     numbers: Vec<f32>,
-    /// The end of each frame's numbers.
+    /// The index in `numbers` at which each frame's values end.
     ends: Vec<usize>,
 }
 
-/// Calls `f(sums, frame, numbers)` for all frames, with `n(frame)` numbers that are initially 0. Returns the numbers,
-/// and the sums of each chunk of frames.
+/// Calls `f(sums, frame, numbers)` for each frame, where `numbers` contains `n(frame)` zeros to overwrite. Returns the
+/// numbers of all frames, and the sums of each chunk of frames.
 pub(super) fn frames<A: Send>(
     n_frames: usize,
     n: impl Fn(usize) -> usize + Sync,
@@ -145,7 +145,7 @@ impl Frames {
         frames(n_frames, |_| n, || (), copy).0
     }
 
-    /// Returns the numbers of a frame.
+    /// Returns the values of a frame.
     #[inline(always)]
     pub(super) fn frame(&self, frame: usize) -> &[f32] {
         let (chunk, at) = (&self.chunks[frame / self.length], frame % self.length);
@@ -153,7 +153,7 @@ impl Frames {
         &chunk.numbers[start..chunk.ends[at]]
     }
 
-    /// Returns the numbers of all frames.
+    /// Returns the values of all frames.
     pub(crate) fn concat(mut self) -> Vec<f32> {
         match self.chunks.len() {
             1 => self.chunks.remove(0).numbers,

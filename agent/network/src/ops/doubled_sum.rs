@@ -6,7 +6,7 @@ use candle_core::{CpuStorage, CustomOp2, Device, Layout, Result, Shape, Tensor, 
 use rayon::prelude::*;
 
 /// The operator. Its arguments are images `[batch, channels, rows, cols]` and `[batch, channels, 2 rows, 2 cols]`. The
-/// result has the shape of the second.
+/// result has the shape of the second image.
 pub(crate) struct DoubledSum;
 
 impl CustomOp2 for DoubledSum {

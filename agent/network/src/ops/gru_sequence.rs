@@ -9,7 +9,7 @@ struct Gru {
     n: usize,
     /// `W_hh [3 n, n]`.
     w: Vec<f32>,
-    /// `h` before each step, and after the last.
+    /// `h` before each step, and after the last step.
     h: Vec<f32>,
     /// Intermediate results of each step: r, z, the candidate and `W_hn h + b_hn`.
     steps: Vec<f32>,

@@ -21,7 +21,7 @@ pub(crate) struct ImageConv {
     pub(crate) kernel: usize,
     pub(crate) stride: usize,
     pub(crate) dilation: usize,
-    /// Whether ReLU follows, which replaces negative results by 0.
+    /// Whether ReLU follows, which replaces negative results with 0.
     pub(crate) relu: bool,
 }
 
@@ -65,7 +65,7 @@ impl ImageConv {
 struct Call {
     conv: ImageConv,
     adds_image: bool,
-    /// Whether each result passed ReLU. The output of a residual layer does not reveal it.
+    /// Whether each result passed ReLU. The output of a residual layer does not reveal this.
     kept: OnceLock<Vec<bool>>,
 }
 
@@ -213,7 +213,7 @@ impl CustomOp3 for Call {
     }
 }
 
-/// The common inputs of the gradients of all images.
+/// The inputs that the gradients of all images have in common.
 struct Back<'a> {
     call: &'a Call,
     conv: &'a Conv,
@@ -270,7 +270,7 @@ mod tests {
             .expect("numbers")
     }
 
-    /// Returns the largest difference, relative to the largest number.
+    /// Returns the largest absolute difference, relative to the largest absolute value.
     fn off(got: &Tensor, expected: &Tensor) -> Result<f64> {
         let got = got.to_dtype(DType::F64)?;
         let largest = |tensor: &Tensor| tensor.abs()?.max_all()?.to_scalar::<f64>();
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn results_and_gradients_are_those_of_candles_layers_in_64_bits() {
+    fn results_and_gradients_agree_with_candle_in_64_bits() {
         for kernel in [1, 3, 5] {
             for (stride, dilation, relu, n, batch) in [
                 (1, 1, true, 5, 9),
@@ -335,14 +335,14 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused() {
+    fn images_that_do_not_fit_are_rejected() {
         let conv = ImageConv {
             kernel: 3,
             stride: 2,
             dilation: 1,
             relu: true,
         };
-        // The second image has an odd side, and the third has another number of channels.
+        // The second image has an odd side, and the third has a different number of channels.
         for (x, is_refused) in [
             ([1, 2, 4, 4], false),
             ([1, 2, 5, 4], true),

@@ -2,7 +2,7 @@
 
 use super::cpu::total;
 
-/// Added to the variance, as in PyTorch.
+/// A constant that is added to the variance, as in PyTorch.
 pub(crate) const EPSILON: f64 = 1e-5;
 
 /// Mean and variance of each channel, over all frames and positions.
@@ -16,7 +16,7 @@ pub(crate) struct Moments {
 }
 
 impl Moments {
-    /// Computes moments from sums of values and of their squares, both before the multiplication by `scale`.
+    /// Computes moments from sums of values and of their squares, both taken before values are multiplied by `scale`.
     pub(super) fn new(sums: &Sums, scale: f32, count: usize) -> Self {
         let (scale, count) = (f64::from(scale), count as f64);
         let mean: Vec<f64> = sums.first.iter().map(|sum| scale * sum / count).collect();
@@ -30,7 +30,8 @@ impl Moments {
     }
 }
 
-/// Sums over all positions, per channel. The backward pass sums `dy` and `dy z`, and moments sum `z` and `z^2` instead.
+/// Sums over all positions, per channel. The backward pass sums `dy` and `dy z`. For moments, the sums are over `z` and
+/// `z^2` instead.
 #[derive(Debug, Clone)]
 pub(super) struct Sums {
     /// The sum of `dy` at kept positions.
@@ -51,7 +52,7 @@ impl Sums {
         }
     }
 
-    /// Adds `f(a, b)` for each pair of numbers of a channel's planes.
+    /// Adds `f(a, b)` for each pair of values of a channel's planes.
     #[inline(always)]
     pub(super) fn add(
         &mut self,

@@ -1,9 +1,9 @@
-//! Products of small matrices whose rows lie at arbitrary offsets, such as the planes of kept channels. Nothing is
-//! copied.
+//! Products of small matrices whose rows lie at arbitrary offsets, such as the planes of kept channels. The matrices
+//! are not copied.
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// The left factor of a product. The number in a row for a term is at index `rows[row] + terms[term]`.
+/// The left factor of a product. The element in row `row` and column `term` is at index `rows[row] + terms[term]`.
 #[derive(Clone, Copy)]
 pub(super) struct Left<'a> {
     numbers: &'a [f32],
@@ -11,7 +11,7 @@ pub(super) struct Left<'a> {
     terms: &'a [usize],
 }
 
-/// The right factor of a product. The row of a term starts at index `terms[term]`.
+/// The right factor of a product. Row `term` starts at index `terms[term]`.
 #[derive(Clone, Copy)]
 pub(super) struct Right<'a> {
     numbers: &'a [f32],
@@ -47,7 +47,7 @@ pub(super) fn steps(n: usize, step: usize) -> Vec<usize> {
     (0..n).map(|at| at * step).collect()
 }
 
-/// Computes `out = left right`. `rows` has the start of each row in `out`.
+/// Computes `out = left right`. `rows` contains the start of each row in `out`.
 ///
 /// # Panics
 /// If an index is outside its slice.
@@ -55,7 +55,7 @@ pub(super) fn product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Ri
     compute(out, rows, left, right, false);
 }
 
-/// Computes `out += left right`, like [`product`].
+/// Computes `out += left right`, with the same arguments as [`product`].
 pub(super) fn add_product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>) {
     compute(out, rows, left, right, true);
 }
@@ -101,7 +101,7 @@ struct Call<'a> {
     rows: &'a [usize],
     left: Left<'a>,
     right: Right<'a>,
-    /// Whether the product is added to the previous numbers.
+    /// Whether the product is added to the previous values.
     adds: bool,
 }
 
@@ -154,7 +154,7 @@ impl Call<'_> {
         }
     }
 
-    /// Computes a block of `ROWS` rows, whose sums stay in registers. With `WHOLE`, all vectors are inside the row.
+    /// Computes a block of `ROWS` rows, whose sums stay in registers. With `WHOLE`, all vectors lie inside the row.
     #[inline(always)]
     #[expect(
         unsafe_code,
@@ -202,7 +202,7 @@ impl Call<'_> {
     }
 }
 
-/// Access to a vector in memory. With `WHOLE`, reads and writes all lanes. Otherwise only the given number of lanes.
+/// Access to a vector in memory. With `WHOLE`, it reads and writes all lanes, otherwise only the given number of lanes.
 #[derive(Clone, Copy)]
 struct Vector<const WHOLE: bool>(usize);
 
@@ -242,7 +242,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn products_of_scattered_rows_are_those_of_the_definition() {
+    fn products_of_scattered_rows_agree_with_the_definition() {
         for [n_rows, n_terms, cols] in [[1, 1, 1], [8, 3, 16], [13, 5, 32], [7, 9, 50]] {
             let numbers = |n: usize, step: usize| -> Vec<f32> {
                 (0..n).map(|i| (i * step % 11) as f32 - 5.0).collect()

@@ -2,7 +2,8 @@
 //!
 //! Only the convolutions' results are stored between the passes over the frames. Activations are recomputed. A
 //! convolution is linear, so `conv(x) = conv(x - floors) + conv(floors)`. In the first term, dropped channels are zero
-//! and are skipped. The second term is the same for all frames and is computed once. Gradients follow the same split.
+//! and are skipped. The second term is the same for all frames and is computed once. Gradients are split in the same
+//! way.
 
 use super::activation::{Activation, Order, ResultGradient};
 use super::conv::{Buffers, Conv};
@@ -256,8 +257,8 @@ impl Stage {
         }
     }
 
-    /// Adds the gradient of the weights from the inputs in `to.buffers` and the gradient `to.d_out` of the outputs, and
-    /// writes the gradient `to.dx` of the inputs if it is needed.
+    /// Adds the gradient of the weights, computed from the inputs in `to.buffers` and the gradient `to.d_out` of the
+    /// outputs. Also writes the gradient `to.dx` of the inputs if it is needed.
     #[inline(always)]
     fn add_gradients(
         &self,

@@ -126,7 +126,8 @@ fn check_updates(double: bool) -> Result<()> {
     for ((name, _, got), var) in layers(&dqn).zip(&vars) {
         let expected: Vec<f32> = var.flatten_all()?.to_vec1()?;
         let off = got.iter().zip(&expected).map(|(a, b)| (a - b).abs());
-        // Adam's step is .01 whatever the gradient, so rounding errors of gradients near zero are visible.
+        // Adam's step is .01 regardless of the gradient's magnitude, so rounding errors of gradients near zero are
+        // visible.
         assert!(off.fold(0.0, f32::max) < 1e-3, "{name}");
     }
     Ok(())
@@ -172,7 +173,7 @@ fn saved(dqn: &Dqn) -> Saved {
     (dqn.named_tensors(), dqn.saved())
 }
 
-/// Loads a saved state. The error names a missing tensor.
+/// Loads a saved state. If a tensor is missing, the error names it.
 fn load(dqn: &mut Dqn, (tensors, saved): &Saved) -> std::result::Result<(), NetworkError> {
     let find = |name: &str, dims: &[usize]| {
         let found = tensors.iter().find(|tensor| tensor.0 == name);
@@ -270,7 +271,7 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
             |_, rows| rows[0].reward = f32::NEG_INFINITY,
             "dqn.replay.reward",
         ),
-        // Its square is not finite.
+        // The square of this reward is not finite.
         (|_, rows| rows[3].reward = 1e30, "loss"),
         (
             |dqn, _| dqn.set_learning_rate(f32::INFINITY),

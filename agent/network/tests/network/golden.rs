@@ -61,7 +61,7 @@ fn frames(golden: &mut Golden) -> Vec<Frame> {
         .collect()
 }
 
-/// Returns the largest difference, relative to the largest number.
+/// Returns the largest absolute difference, relative to the largest absolute value.
 fn relative<'a>(
     got: impl IntoIterator<Item = &'a f32>,
     expected: impl IntoIterator<Item = impl Borrow<f32>>,

@@ -17,7 +17,7 @@ fn numbers(tensor: &Tensor) -> Vec<f64> {
     numbers.expect("numbers")
 }
 
-/// Returns the largest difference, relative to the largest number.
+/// Returns the largest absolute difference, relative to the largest absolute value.
 fn off(got: &Tensor, expected: &Tensor) -> f64 {
     let (got, expected) = (numbers(got), numbers(expected));
     assert_eq!(got.len(), expected.len());
@@ -72,7 +72,8 @@ fn network_and_gradients_equal_candles_layers_in_64_bits() {
     }
 }
 
-/// Creates lessons on a rectangular grid. Cells left of a column show 1, the others show 0 and 2 in alternate steps.
+/// Creates lessons on a rectangular grid. Cells in the left half show 1. The other cells show 0 and 2 in alternate
+/// steps.
 fn lessons(n: u64) -> Vec<Lesson> {
     let shape = Shape::new(21, 18).expect("test shape");
     let (mut before, mut lessons) = (Sightings::new(shape), Vec::new());
@@ -139,8 +140,8 @@ fn on_a_device() -> NeuralBelief {
     network.expect("a network")
 }
 
-/// Returns a base distribution. It does not know which of the two values a cell on the right shows, which depends on
-/// the step.
+/// Returns a base distribution. It does not know which of two values the cells in the right half show, because this
+/// depends on the step.
 fn base_of(cell: usize) -> [f32; 3] {
     if cell % 18 < 9 {
         [0.1, 0.8, 0.1]
@@ -226,8 +227,8 @@ fn it_learns_alone_and_corrects_the_distributions_of_another() {
             let batch = &lessons[update % 40..][..10];
             network.update(5e-3, batch).expect("finite");
         }
-        // Half of the cells always show 1, the others one of two values. Without the step, the best loss is
-        // `ln(2) / 2`.
+        // Half of the cells always show 1, and the others show one of two values. The best loss of a network that
+        // ignores the step is `ln(2) / 2`.
         assert!(loss(&network) < 0.4, "{}", loss(&network));
         let belief = belief(&network);
         assert!(belief.iter().all(|p| (1e-7..=1.0).contains(p)));

@@ -1,8 +1,8 @@
 //! Comparison of our operators in 32 bits with candle's stock operators in 64 bits.
 //!
 //! The tests use windows of frames with fixed masks, on several grids, with several numbers of states and observations.
-//! The gradient of a tensor passes through all later operators. So a wrong operator affects its own tensors and all
-//! earlier ones.
+//! The gradient of a tensor passes through all later operators. A wrong operator therefore affects the gradients of its
+//! own tensors and of all earlier tensors.
 
 use crate::synthetic::{coin, dropout, frames};
 use candle_core::backprop::GradStore;
@@ -13,7 +13,7 @@ use emberwatch_network::{Network, NetworkShape, Operators, Pass, Window};
 
 const FIRST: [f32; 5] = [0.3, -1.2, 0.7, 0.1, 2.0];
 
-/// Returns the largest difference between two tensors, relative to the largest number.
+/// Returns the largest absolute difference between two tensors, relative to the largest absolute value.
 fn relative(got: &[f64], expected: &[f64]) -> f64 {
     assert_eq!(got.len(), expected.len());
     let pairs = got.iter().zip(expected);
@@ -50,7 +50,7 @@ impl Model {
     fn new(shape: &NetworkShape, dtype: DType, operators: Operators) -> Self {
         let network = |vb| Network::new(&vb, shape, operators);
         let (network, variables) = build(3, dtype, &Device::Cpu, network).expect("a network");
-        // Make the weights and biases of normalisations differ. Round all numbers to 32 bits.
+        // Give the weights and biases of normalisations different values. Round all values to 32 bits.
         for (index, (name, var)) in variables.iter().enumerate() {
             let mut numbers = numbers(var);
             if var.rank() == 1 && !name.contains("running") {

@@ -42,7 +42,7 @@ pub fn coin(layer: usize, frame: usize, channel: usize) -> bool {
     split_mix(layer as u64 * 1000 + frame as u64, channel as u64) & 1 == 1
 }
 
-/// Creates a pool with a number of threads, on which no result may depend.
+/// Creates a pool with the given number of threads. No result may depend on this number.
 pub fn rayon_pool(n_threads: usize) -> rayon::ThreadPool {
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(n_threads)

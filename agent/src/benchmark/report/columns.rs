@@ -12,7 +12,7 @@ type Cell<'a> = Box<dyn Fn(&Group<'_>) -> String + 'a>;
 pub(super) struct Columns<'a>(Vec<(String, Cell<'a>)>);
 
 impl<'a> Columns<'a> {
-    /// Returns the columns that name a group, including its team and number of robots if any group is a team.
+    /// Returns the columns that name each group. If any group is a team, they include team and number of robots.
     pub(super) fn of_names(groups: &[Group<'_>]) -> Self {
         let mut columns = Self::default();
         columns.add("policy", |group| group.policy.into());
@@ -52,7 +52,7 @@ impl<'a> Columns<'a> {
         self.add(heading, cell);
     }
 
-    /// Adds a column of differences, paired by world, to the baseline in team `alone` with as many robots.
+    /// Adds a column of differences from the baseline with as many robots, in team `alone`. They are paired by world.
     pub(super) fn add_difference(
         &mut self,
         groups: &'a [Group<'a>],
@@ -81,7 +81,7 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// Builds a Markdown table. All columns but names are right-aligned.
+/// Builds a Markdown table. All columns except names are right-aligned.
 pub(super) fn markdown<H: AsRef<str>>(
     headings: &[H],
     rows: impl Iterator<Item = Vec<String>>,

@@ -5,15 +5,15 @@ use anyhow::{Context, Result, ensure};
 use std::collections::BTreeMap;
 use std::fmt::Display;
 
-/// The worlds of a comparison, a task, or a task of the leaderboard.
+/// The worlds that runs of a comparison, a task or the leaderboard must have in common.
 #[derive(Debug, Clone)]
 pub struct CommonWorlds {
-    /// The server's `worlds_fingerprint`; `None`: it is not compared.
+    /// The server's `worlds_fingerprint`. `None` skips this check.
     pub fingerprint: Option<String>,
-    /// In ascending order.
+    /// World seeds, in ascending order.
     pub seeds: Vec<u64>,
     pub steps: u64,
-    /// Moves of a path, robots of a world and recent steps; `None`: they are not compared.
+    /// Moves per path. For this and the next two fields, `None` skips the check.
     pub moves: Option<usize>,
     pub robots: Option<u32>,
     pub recent_steps: Option<u32>,
@@ -51,7 +51,7 @@ impl CommonWorlds {
     }
 }
 
-/// Checks runs of other files before a comparison of `policies` starts.
+/// Checks runs from other files before a comparison of `policies` starts.
 pub fn check_added(added: &[PolicyRun], policies: &[&str], worlds: &CommonWorlds) -> Result<()> {
     for group in groups(added) {
         let policy = group.policy;
@@ -77,7 +77,7 @@ pub fn check_added(added: &[PolicyRun], policies: &[&str], worlds: &CommonWorlds
     Ok(())
 }
 
-/// Checks that runs of other files had the same number of burning cells. A world's fire depends on its seed, model,
+/// Checks that runs from other files had the same number of burning cells. A world's fire depends on its seed, model,
 /// grid and burn-in, but not on the policy.
 pub fn check_fire(added: &[PolicyRun], runs: &[PolicyRun]) -> Result<()> {
     let fire = runs.iter().map(|run| (run.world_seed, run.mean_fire_cells));
@@ -90,7 +90,7 @@ pub fn check_fire(added: &[PolicyRun], runs: &[PolicyRun]) -> Result<()> {
     Ok(())
 }
 
-/// Returns the number of worlds in words, with the first and the last seed.
+/// Describes worlds by their number and their first and last seed.
 fn counted(seeds: &[u64]) -> String {
     match seeds {
         [] => "none".into(),

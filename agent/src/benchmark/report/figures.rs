@@ -16,7 +16,7 @@ use emberwatch_protocol::{Cell, Frame, Grid, Model, UNOBSERVED};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Label of a reward axis: what the wildfire model's reward counts.
+/// Label of the reward axis for the wildfire model, whose reward counts these cells.
 pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";
 
 /// Legend and colour of policies that sample paths on the known model. Policies that search have another colour.
@@ -38,7 +38,7 @@ pub struct Snapshot {
     pub path_cells: Vec<Cell>,
     /// The posterior after the frame, if frames update the policy's belief.
     pub belief: Option<Belief>,
-    /// The state that pays most, in a belief with learned states; `None` if the states are the model's.
+    /// For a belief with learned states, the state with the highest reward. `None` if the states are the model's.
     pub learned_target: Option<usize>,
 }
 
@@ -142,7 +142,7 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], height: Height) -> Bar {
     let remark: Vec<&str> = team.into_iter().chain(estimator).collect();
     let remark = match remark.as_slice() {
         [] => String::new(),
-        // SVG renderers drop an ordinary space between two parts of a text.
+        // SVG renderers drop an ordinary space between two text elements.
         remark => format!("\u{a0}({})", readable(&remark.join(", "))),
     };
     let pair = |run: &&PolicyRun| (run.world_seed, run.mean_reward);
@@ -185,8 +185,8 @@ fn chart(group: &Group<'_>) -> (&'static str, Color) {
     chart_of(belief)
 }
 
-/// Draws the reward of all robots of a world over their number, with one curve per kind of team. Draws nothing if all
-/// runs have the same number of robots.
+/// Draws the total reward of a world's robots against their number, with one curve per kind of team. Draws nothing if
+/// all runs have the same number of robots.
 pub fn draw_teams(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
     if runs.iter().all(|run| run.robots == runs[0].robots) {
         return Ok(());

@@ -364,7 +364,7 @@ fn n_tasks(n: usize, tasks: &[TaskRuns]) -> String {
     format!("{n} of {}", tasks.len())
 }
 
-/// Draws each entry's score over tasks, with a mark for its mean in each task. Without all tasks, draws marks only.
+/// Draws each entry's score over tasks, with a mark for its mean in each task. Entries that lack a task get only marks.
 pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
     let tasks = merged(entries);
     let runs = entries.iter().flat_map(|entry| {

@@ -5,7 +5,7 @@ use crate::benchmark::report::statistics::Estimate;
 /// Placeholder for a missing number.
 pub const NOTHING: &str = "-";
 
-/// Returns the number of decimals that show about three digits of the largest value, at least two.
+/// Returns the number of decimals, at least two, that shows about three digits of the largest absolute value.
 pub fn decimals(values: impl Iterator<Item = f64>) -> usize {
     let largest = values.fold(0.0_f64, |largest, value| largest.max(value.abs()));
     match largest {
@@ -27,7 +27,7 @@ pub fn with_error(estimate: Option<Estimate>, decimals: usize) -> String {
     }
 }
 
-/// Like [`with_error`], with a plus sign unless the mean is negative.
+/// Like [`with_error`], but with a plus sign unless the mean is negative.
 pub(super) fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
     let text = with_error(estimate, decimals);
     let sign = if estimate.is_some() && !text.starts_with('-') {

@@ -35,10 +35,10 @@ pub struct PolicyRun {
     /// Share of the robots' visits to distinct cells that repeat a teammate's visit in the same step, in `0..1`.
     #[serde(default)]
     pub mean_repeated: f64,
-    /// Steps until a robot first visited a burning cell; `None`: never. This and the next five fields are defined in
-    /// `docs/figures-of-merit.md`, and missing in old files.
+    /// Steps until a robot first visited a burning cell, `None` if never. This and the next five fields are defined in
+    /// `docs/figures-of-merit.md`, and are missing in old files.
     pub steps_to_detection: Option<u64>,
-    /// Burning cells of the world in that step.
+    /// Number of burning cells in the world at that step.
     pub burning_cells_at_detection: Option<u32>,
     /// Steps for which a cell counts as seen after a visit.
     pub recent_steps: Option<u32>,
@@ -48,7 +48,7 @@ pub struct PolicyRun {
     pub front_distance: Option<f64>,
     /// Share of the grid's cells that were ever seen.
     pub grid_seen_share: Option<f64>,
-    /// Mean `ln P(y)` of a visited cell under the prediction before the frame; `None` if nothing is predicted.
+    /// Mean `ln P(y)` of a visited cell under the prediction made before the frame; `None` if nothing is predicted.
     pub log_likelihood: Option<f64>,
     /// The server's `worlds_fingerprint`; empty in files of earlier releases.
     #[serde(default)]
@@ -58,7 +58,7 @@ pub struct PolicyRun {
     pub policy_fingerprint: String,
     /// Processor seconds of training for the world's task, if `suite` recorded them.
     pub training_seconds: Option<f64>,
-    /// Whether it comes from a file of `--add`.
+    /// Whether the run comes from a file given by `--add`.
     #[serde(skip)]
     pub is_added: bool,
     /// Reward of each step, in order.
@@ -90,13 +90,13 @@ impl Group<'_> {
         Estimate::of(&values)
     }
 
-    /// Returns the values of the runs that have one, by seed.
+    /// Returns the values by seed. Runs without a value are left out.
     pub(super) fn by_seed(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> BTreeMap<u64, f64> {
         let pair = |run: &&PolicyRun| Some((run.world_seed, value(run)?));
         self.runs.iter().filter_map(pair).collect()
     }
 
-    /// Returns false only for one robot alone in its world.
+    /// Returns whether the group is a team. A single robot in team `alone` is not a team.
     pub(super) fn is_team(&self) -> bool {
         (self.robots, self.team) != (1, ALONE)
     }
@@ -109,7 +109,7 @@ impl Group<'_> {
         }
     }
 
-    /// Returns the marks that distinguish the group from others of its policy: estimator and team, if they differ.
+    /// Returns the marks that distinguish the group from the policy's other groups: estimator and team, if they differ.
     pub(super) fn marks(&self, groups: &[Self]) -> Vec<String> {
         let twins = || groups.iter().filter(|other| other.policy == self.policy);
         let mut marks = Vec::new();

@@ -1,4 +1,5 @@
-//! Rewards over time: a moving average per policy, with standard errors over worlds, before shaded burning cells.
+//! Plots rewards over time: a moving average per policy, with standard errors over worlds. The number of burning cells
+//! is shaded in the background.
 
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
@@ -6,12 +7,13 @@ use crate::benchmark::report::statistics::Estimate;
 use emberwatch_figures::{Curve, Lines, MAX_CURVES, Panel, Scale, Shade};
 use std::collections::BTreeSet;
 
-/// Maximum number of points of a curve. More would be hardly visible, and enlarge the file.
+/// Maximum number of points of a curve. More points would hardly be visible, and would enlarge the file.
 const MAX_POINTS: usize = 500;
 /// The moving average spans about 1 / `WINDOWS` of the steps.
 const WINDOWS: usize = 40;
 
-/// Returns the page of these runs, each with at least one reward. `fire_cells`: burning cells per step, may be empty.
+/// Returns the page for these runs, each of which has at least one reward. `fire_cells` is the number of burning cells
+/// per step, and can be empty.
 pub fn rewards(runs: &[PolicyRun], axis_label: &str, fire_cells: &[f32]) -> Lines {
     let groups = groups(runs);
     let n_steps = runs.iter().map(|run| run.rewards.len()).max();
@@ -122,7 +124,7 @@ fn moving_average(values: &[f32], window: usize) -> Vec<(f64, f64)> {
     }
     let stride = values.len().div_ceil(MAX_POINTS).max(1);
     let last = values.len();
-    // Counting back from the last step keeps it, whatever the stride.
+    // Counting back from the last step always includes that step, whatever the stride.
     let mut ends: Vec<usize> = (window..=last).rev().step_by(stride).collect();
     ends.reverse();
     let average = |end: usize| (end as f64, (sums[end] - sums[end - window]) / window as f64);

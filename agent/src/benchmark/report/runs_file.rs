@@ -1,4 +1,4 @@
-//! The CSV file of runs, which one process at a time replaces.
+//! The CSV file of runs, which only one process at a time can replace.
 //!
 //! `emberwatch.benchmark` in Python locks and replaces it in the same way, so that no writer loses another's rows.
 
@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
-/// A CSV file of runs, locked until it is dropped. A new file without runs is removed again.
+/// A CSV file of runs, locked until this value is dropped. If the file is new and gets no runs, it is removed again.
 #[derive(Debug)]
 pub struct RunsFile {
     path: PathBuf,
@@ -20,10 +20,10 @@ pub struct RunsFile {
 }
 
 impl RunsFile {
-    /// Creates the file if it is missing, and locks it. Waits for another process's lock, for `patience` at most.
+    /// Creates the file if it is missing, and locks it. If another process has it locked, waits at most `patience`.
     ///
     /// # Errors
-    /// If the file cannot be replaced, or another process holds its lock for longer.
+    /// If the file cannot be replaced, or if another process still holds the lock after `patience`.
     pub fn lock(path: &Path, patience: Duration) -> Result<Self> {
         let locked = || {
             ensure!(
@@ -64,7 +64,7 @@ impl Drop for RunsFile {
     fn drop(&mut self) {
         let is_empty = self.file.metadata().is_ok_and(|found| found.len() == 0);
         if is_empty && is_at(&self.path, &self.file) {
-            // An empty file that stays does no harm.
+            // If removal fails, the empty file does no harm.
             let _ = std::fs::remove_file(&self.path);
         }
     }
@@ -96,12 +96,12 @@ fn lock(path: &Path, deadline: Instant) -> Result<File> {
         let file = options.open(path)?;
         match file.try_lock() {
             Ok(()) if is_at(path, &file) => return Ok(file),
-            // Another process has replaced or removed it since it was opened.
+            // Another process has replaced or removed the file since it was opened.
             Ok(()) => continue,
             Err(TryLockError::Error(error)) => bail!(error),
             Err(TryLockError::WouldBlock) => ensure!(
                 Instant::now() < deadline,
-                "another process is writing it: wait for its end, or choose another file"
+                "another process is writing it: wait until it has finished, or choose another file"
             ),
         }
         std::thread::sleep(RETRY_INTERVAL);

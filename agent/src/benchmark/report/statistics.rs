@@ -8,14 +8,14 @@ use std::collections::BTreeMap;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     pub mean: f64,
-    /// Standard error of the mean; one world has none.
+    /// Standard error of the mean; `None` for a single world.
     pub standard_error: Option<f64>,
     /// Number of worlds, at least 1.
     pub n_worlds: usize,
 }
 
 impl Estimate {
-    /// Computes mean and standard error (with `n - 1`) of one value per world; `None` without a world.
+    /// Computes mean and standard error (with `n - 1`) of one value per world; `None` if there is no world.
     pub fn of(values: &[f64]) -> Option<Self> {
         let n_worlds = values.len();
         if n_worlds == 0 {

@@ -1,5 +1,5 @@
-//! One score over all tasks: the interquartile mean of rewards, scaled between a random walk's and an oracle's, with
-//! its confidence interval.
+//! One score over all tasks: the interquartile mean of rewards, with its confidence interval. Rewards are scaled so
+//! that a random walk scores 0 and an oracle scores 1.
 //!
 //! Defined by Agarwal et al. (2021), *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, and
 //! computed as in `rliable`.
@@ -35,7 +35,7 @@ pub struct TaskRuns {
     pub runs: Vec<PolicyRun>,
 }
 
-/// The mean rewards in one world, of both ends of the scale and of a policy.
+/// The mean rewards of a policy, the random walk and the oracle in one world.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WorldRewards {
     pub floor: f64,
@@ -55,7 +55,7 @@ impl Aggregate {
     /// Computes the score from the rewards in each task's worlds; `None` if a task has no scores.
     ///
     /// The interval comes from a stratified bootstrap. Each draw resamples the worlds of each task with replacement,
-    /// both for the policy's rewards and for the ends of the scale. Policies on the same worlds have the same draws.
+    /// both for the policy's rewards and for the ends of the scale. Policies on the same worlds use the same draws.
     /// Draws in which a task's ceiling is not above its floor have no scale and are left out.
     pub fn of(tasks: &[Vec<WorldRewards>]) -> Option<Self> {
         let mean = score(tasks.iter().map(|worlds| worlds.iter().copied()))?;
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn the_score_is_that_of_rliable() {
+    fn scores_match_rliable() {
         let tasks = [
             worlds(&[0.21, 0.21, 0.33, 0.07, -0.03, 0.13, 0.24, 0.34]),
             worlds(&[0.57, 0.49, 0.79, 0.48, 0.56, 0.49, 0.81, 0.47]),
@@ -271,13 +271,13 @@ mod tests {
     }
 
     #[test]
-    fn a_draw_of_worlds_draws_the_ends_of_the_scale_with_the_policy() {
+    fn bootstrap_draws_also_resample_both_ends_of_the_scale() {
         let world = |policy: f64| WorldRewards {
             floor: policy / 2.0,
             ceiling: 2.0 * policy,
             policy,
         };
-        // All worlds have the same ratios, so that only the drawn mixture of worlds varies.
+        // All worlds have the same reward ratios, so only the drawn mixture of worlds varies.
         let equal = [vec![world(1.0), world(1.0), world(1.0), world(1.0)]];
         let point = Aggregate::of(&equal).expect("scores");
         assert_eq!(point.interval, Some([point.mean; 2]));

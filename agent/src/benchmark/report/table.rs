@@ -1,4 +1,4 @@
-//! The comparison as text: fits a terminal, and pastes into Markdown as a table.
+//! The comparison as text that fits a terminal, and that Markdown renders as tables.
 
 use crate::benchmark::report::columns::Columns;
 use crate::benchmark::report::merit::merit_table;
@@ -11,9 +11,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Estimator label of the oracles. The table shows rewards as a percentage of the best oracle's.
 const TRUTH: &str = "truth";
 
-/// Renders every policy over all worlds, its figures of merit, then the worlds with less and with more fire.
+/// Renders the rewards and figures of merit of every policy over all worlds, then the rewards by amount of fire.
 ///
-/// Policies keep their order. `baseline` names the policy to which paired differences are computed.
+/// Policies keep their order. `baseline` names the policy that paired differences are relative to.
 pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
     let groups = groups(runs);
     if groups.is_empty() {
@@ -95,8 +95,8 @@ fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
     ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
 }
 
-/// Renders mean rewards over the half of the worlds with less fire, and over the half with more. The middle one of an
-/// odd number of worlds belongs to the half with more.
+/// Renders mean rewards over the half of the worlds with less fire, and over the half with more. If the number of
+/// worlds is odd, the middle world belongs to the half with more.
 fn split_by_fire(runs: &[PolicyRun], groups: &[Group<'_>]) -> String {
     let mut fire_of: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
     for run in runs {

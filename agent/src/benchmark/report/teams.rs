@@ -1,4 +1,4 @@
-//! The reward of a team over the number of its robots.
+//! Plots the reward of a team against its number of robots.
 
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};

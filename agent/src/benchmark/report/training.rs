@@ -69,8 +69,8 @@ fn panels(rows: &Rows) -> Vec<Panel> {
     panels.map(panel).into()
 }
 
-/// Returns a column's means over equal parts of the rows, each at the part's last world step. They have standard errors
-/// if a part has several rows.
+/// Returns a column's means over equal parts of the rows, each at the part's last world step. If a part has several
+/// rows, its mean has a standard error.
 fn averages(rows: &Rows, column: &str, name: &str) -> Curve {
     let (steps, values) = (rows.column("world_steps"), rows.column(column));
     let part = rows.len().div_ceil(POINTS).max(1);

@@ -1,4 +1,4 @@
-//! Stand-ins for systems other than Linux, which cannot connect to servers or publish beliefs.
+//! Stand-ins for `wire` on systems other than Linux, where connecting and publishing are impossible.
 
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::backend::{Backend, StepAnswer};
@@ -74,7 +74,7 @@ impl<H> Observer<H> {
     }
 }
 
-/// A channel that nobody observes.
+/// A channel that nobody can observe.
 pub struct Feed;
 
 /// A belief for observers.

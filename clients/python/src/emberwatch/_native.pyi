@@ -61,17 +61,17 @@ MAX_MOVES: int
 #: Maximum number of rows and columns that a robot sees beyond its cell.
 MAX_RADIUS: int
 
-#: Maximum number of rows, and of columns, of a grid.
+#: Maximum height and maximum width of a grid, in cells.
 MAX_SIDE: int
 
-#: Maximum number of states, and of observations, of a model.
+#: Maximum number of states of a model, and maximum number of its observations.
 MAX_VALUES: int
 
 def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
     """Returns the texts of built-in files by name; `states` are descriptions of recorded states."""
 
 def explain(status: int, detail: int) -> tuple[str, str] | None:
-    """Returns the name of a status code and its message; None if no refusal has the code."""
+    """Returns the name and the message of a status code; None if the code is not a refusal."""
 
 def check_settings(settings: str) -> str:
     """Checks settings in JSON, and returns them with all defaults, as JSON."""
@@ -110,7 +110,7 @@ class Answer:
     ) -> Answer:
         """Wraps a payload: results of the worlds, results of the robots, frames.
 
-        `team`: number of robots of each world.
+        `team`: number of robots in each world.
         """
 
     @property
@@ -143,22 +143,22 @@ class Answer:
     def numbers(self, pays: int) -> _Numbers:
         """Returns the results of the first robot.
 
-        They are reward, terminated, truncated, step, number of distinct visited cells, and cell (a
-        new array, `(1, 2)`). `pays` chooses the reward: 0 share, 1 team, 2 marginal.
+        The tuple has reward, terminated, truncated, step, number of distinct visited cells, and
+        cell (a new array, `(1, 2)`). `pays` chooses the reward: 0 share, 1 team, 2 marginal.
         """
 
 def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
     """Returns the results of many robots as new arrays, from bytes of `wire.RESULT_DTYPE`.
 
-    They are rewards, terminated, truncated, steps and numbers of distinct visited cells, `(n,)`
-    each; cells, `(n, 2)`; and whether any episode is over. `pays` is as in `Answer.numbers`.
+    The tuple has rewards, terminated, truncated, steps and numbers of distinct visited cells,
+    `(n,)` each; cells, `(n, 2)`; and whether any episode is over. `pays`: as in `Answer.numbers`.
     """
 
 def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8] | None:
-    """Checks paths, and returns them as bytes, `(n_robots, n_moves)`; None as in `Lease.step`."""
+    """Checks paths; returns them as bytes, `(n_robots, n_moves)`, or None as `Lease.step` does."""
 
 class Server:
-    """A connection to a server, or worlds in this process. Threads may share it, and take turns."""
+    """A connection to a server, or worlds in this process. Calls of several threads take turns."""
 
     def __init__(self, instance: str, client: str, seconds: float) -> None:
         """Connects to a server; `client` names this program in the server's log."""
@@ -167,11 +167,11 @@ class Server:
     def embedded(settings: str, warns: bool) -> Server:
         """Creates worlds in this process with settings of `config/server.toml`, as JSON.
 
-        `warns`: whether to warn about start cells that no-fly cells enclose.
+        If `warns` is set, warns about start cells that no-fly cells enclose.
         """
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
-        """Returns hidden states of worlds in this process, as fields of `Truth`.
+        """Returns the hidden states of worlds in this process, as the fields of `Truth`.
 
         Refused on a connection to a server.
         """
@@ -200,7 +200,7 @@ class Server:
         """Closes the connection. May be called again."""
 
 class Options:
-    """Beliefs about worlds with one robot each, and plans in them; worlds count from 0."""
+    """Beliefs about worlds of one robot each, and plans for the robots. Worlds count from 0."""
 
     def __init__(
         self,
@@ -213,15 +213,15 @@ class Options:
     ) -> None:
         """Checks all arguments.
 
-        `watched`: the instance on which beliefs are published, and the number of world 0 there.
+        `watched`: instance on which beliefs are published, and the number of world 0 there.
         """
 
     @property
     def estimator(self) -> str:
-        """Name of the estimator that keeps the beliefs."""
+        """Name of the estimator that computes the beliefs."""
 
     def begin(self, worlds: list[int], seeds: list[int]) -> None:
-        """Starts episodes in `worlds` with their seeds, from the first belief."""
+        """Starts episodes in `worlds` with these seeds; resets the beliefs about these worlds."""
 
     def take_over(self, world: int, kind: str, data: bytes) -> bool:
         """Loads another client's belief about the current step; False if it does not fit."""
@@ -230,7 +230,7 @@ class Options:
         """Returns the kind and the bytes of a belief, for the next client."""
 
     def see(self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]) -> None:
-        """Updates beliefs with an earlier step; `results` as in `plan`, frames `(n, H, W)`."""
+        """Updates beliefs with an earlier step. `results`: as in `plan`; `frames`: `(n, H, W)`."""
 
     def plan(
         self,
@@ -241,7 +241,7 @@ class Options:
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Updates beliefs with the current step, unless `frames` is None, then plans.
 
-        `results`: bytes of `wire.RESULT_DTYPE`. `flown`: the flown option of each world.
+        `results`: bytes of `wire.RESULT_DTYPE`. `flown`: the option flown in each world.
 
         Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
         worlds, as new arrays.
@@ -253,8 +253,9 @@ class Options:
 class Flights:
     """The incomplete path of each robot, one row for each robot.
 
-    With `reward`, the rewards by state, each cell pays by its hidden state when the path first
-    visits it, or first sees it if the airspace pays seen cells. A copy or pickle has no moves.
+    `reward` is the reward of each state. If given, each cell pays the reward of its hidden state
+    when the path first visits it, or first sees it if the airspace pays for seen cells. A copied or
+    unpickled object has no moves.
     """
 
     def __init__(
@@ -286,7 +287,7 @@ class Flights:
     def masks(self) -> NDArray[np.int8]:
         """1 for each move that takes a robot to another cell, otherwise 0, `(n_rows, 4)`.
 
-        All 1 in a row in which no move does.
+        If no move does, the whole row is 1.
         """
 
     def begin(
@@ -344,10 +345,10 @@ class Lease:
 
 @final
 class Windows:
-    """A square of cells around each robot, one row for each: the parts `local` and `recent`.
+    """A square of cells around each robot, one row per robot: the parts `local` and `recent`.
 
-    The channels about the world come first. Then follow 255 in the cells that this path has
-    visited, 255 off the grid and in no-fly cells, and 255 times the share of remaining moves.
+    The channels about the world come first. Three channels follow: 255 in the cells that this path
+    has visited; 255 off the grid and in no-fly cells; 255 times the share of remaining moves.
     """
 
     def __new__(
@@ -365,7 +366,7 @@ class Windows:
         """Begins paths in the rows `begun`, with channels `(n_begun, H, W, n_of_world)`."""
 
     def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None:
-        """Marks the visited cells of some robots, and clears world channels of cells that paid."""
+        """Marks the visited cells, and clears the world channels of cells that have paid."""
 
     def around(self, flights: Flights) -> NDArray[np.uint8]:
         """Returns the windows of all robots, `(n_rows, side, side, channels)`; a new array."""
@@ -375,7 +376,7 @@ class Frames:
 
     def __init__(self, instance: str, world: int | None = None) -> None: ...
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Returns the fields of the next sample; None if none comes in time."""
+        """Returns the fields of the next sample; None if none arrives in time."""
 
     def close(self) -> None:
         """Closes the reader. May be called again."""
@@ -385,7 +386,7 @@ class Truths:
 
     def __init__(self, instance: str, world: int | None = None) -> None: ...
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Returns the fields of the next sample; None if none comes in time."""
+        """Returns the fields of the next sample; None if none arrives in time."""
 
     def close(self) -> None:
         """Closes the reader. May be called again."""
@@ -395,7 +396,7 @@ class Outlooks:
 
     def __init__(self, instance: str, world: int | None = None) -> None: ...
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Returns the fields of the next sample; None if none comes in time."""
+        """Returns the fields of the next sample; None if none arrives in time."""
 
     def close(self) -> None:
         """Closes the reader. May be called again."""
@@ -403,7 +404,7 @@ class Outlooks:
 class Recording:
     """A reader of a recording.
 
-    Errors have the code "cut" or "damaged" if all records before are complete.
+    An error with code "cut" or "damaged" means that all earlier records are complete.
     """
 
     def __init__(self, path: str | bytes | PathLike[str]) -> None: ...
@@ -411,7 +412,7 @@ class Recording:
         """Returns nanoseconds, kind, and a server's JSON or a sample's fields; None at the end."""
 
 def estimator_names() -> list[tuple[str, str]]:
-    """Returns the name and a description of each estimator on which options can be planned."""
+    """Returns the name and a description of each estimator that options can be planned with."""
 
 def option_names() -> tuple[list[str], list[str]]:
     """Returns the names of the options, and of the features that describe each plan."""
@@ -420,7 +421,7 @@ def read_model(text: str) -> dict[str, Any]:
     """Returns the fields of `Model` except `toml`; `ValueError` if the text is not a model file."""
 
 def grid_of_maps(path: str) -> tuple[int, int] | None:
-    """Returns height and width of the maps of a model file; None without maps or if invalid."""
+    """Returns height and width of a model file's maps; None if it is invalid or has no maps."""
 
 def model_text(path: str) -> str:
     """Returns the text of a model file, including maps that are in separate files."""
@@ -436,7 +437,7 @@ def read_description(text: str) -> dict[str, Any]:
 
 @final
 class Transition:
-    """``Phi`` for a model file's text on one grid, with its work space."""
+    """The operator ``Phi`` of a model (text of its file) on one grid. Reuses scratch memory."""
 
     def __new__(cls, model: str, height: int, width: int) -> Transition: ...
     def apply(self, beliefs: _Doubles) -> _Doubles:
@@ -447,12 +448,12 @@ class Transition:
 class Estimators:
     """Beliefs of one kind about n worlds; `Belief` checks the arguments.
 
-    `chosen` is a mask of worlds, `(n,)`.
+    `chosen`, `(n,)`, is the mask of the worlds that a call applies to.
     """
 
     @staticmethod
     def known(model: str, prior: NDArray[np.float32], kind: str, n_worlds: int) -> Estimators:
-        """Builds beliefs from a model file's text; `prior`, `(S, H, W)`, is the same for all."""
+        """Builds beliefs from a model file's text. All worlds share the `prior`, `(S, H, W)`."""
 
     @staticmethod
     def load(
@@ -477,30 +478,30 @@ class Estimators:
         """Number of worlds, height and width."""
 
     def belief(self) -> NDArray[np.float32]:
-        """Returns a new array, `(S, n, H, W)`."""
+        """Returns the beliefs as a new array, `(S, n, H, W)`."""
 
     def entropy(self) -> NDArray[np.float32]:
-        """Returns a new array, `(n, H, W)`, in nats."""
+        """Returns the entropy of each cell in nats, as a new array, `(n, H, W)`."""
 
     def reset(self, chosen: NDArray[np.bool_], keeps_correlations: bool) -> None: ...
     def correct(self, frames: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> None:
-        """Corrects the chosen worlds; `frames` has one for each world, `(n, H, W)`."""
+        """Corrects the beliefs about the chosen worlds; one frame for each world, `(n, H, W)`."""
 
     def predict(self, chosen: NDArray[np.bool_]) -> None: ...
     def scores(self, states: NDArray[np.uint8], target: int) -> tuple[_Doubles, _Doubles, _Doubles]:
         """Returns log loss, Brier score and accuracy for states `(n, H, W)`, `(n,)` each."""
 
     def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]:
-        """Returns the log-likelihood of frames `(n, H, W)` and observed cells, `(n,)` each."""
+        """Returns log-likelihoods of frames `(n, H, W)` and numbers of observed cells, `(n,)`."""
 
 def belief_kinds() -> list[tuple[str, str]]:
-    """Returns the name and a description of each kind of belief that frames correct."""
+    """Returns the name and a description of each kind of belief that frames can correct."""
 
 def correct(beliefs: _Doubles, likelihood: _Doubles, frames: NDArray[np.uint8]) -> None:
     """Applies Bayes' rule to `beliefs` in place; shapes `(S, n, H, W)`, `(S, O)`, `(n, H, W)`."""
 
 def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
-    """Returns how often each cell of 64 simulated worlds is in each state, `(S, H, W)`."""
+    """Returns the share of 64 simulated worlds with each cell in each state, `(S, H, W)`."""
 
 def beam_search(
     values: NDArray[np.float32],
@@ -536,7 +537,7 @@ class MeritTally:
         """Returns the fields of `Merit`."""
 
 def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
-    """Checks one integer below `n_choices` for each row, and returns them as bytes.
+    """Checks that each row has one integer below `n_choices`; returns the integers as bytes.
 
-    None if the argument is not a plain array, or not valid.
+    Returns None if the argument is not a plain array, or is invalid.
     """

@@ -52,7 +52,7 @@ def bad_answer(subject: object, expected: object, got: object) -> EmberwatchErro
 
 
 class LeaseLostError(EmberwatchError):
-    """The lease ended, or another client took over robots of it.
+    """The lease ended, or another client took over some of its robots.
 
     `detail` is the process ID of the other client, or 0.
     """

@@ -31,10 +31,10 @@ def beam_search(
             path returns to it.
         n_moves: Number of moves in a path.
         rng: Generator that breaks ties; one number is drawn for each world.
-        visited: Cells that have no value, because they were visited before: those where this array
-            is not 0. Shape (n, H, W).
+        visited: Nonzero in cells that have no value, because they were visited before. Shape
+            (n, H, W).
         width: Number of paths kept after each move, 1 to 65,536; fewer if they would need more
-            than 4 GiB. Of the paths that visited the same cells and end in the same one, only one
+            than 4 GiB. Among paths that visited the same cells and end in the same cell, only one
             is kept.
         airspace: Where the robots may fly, such as `env.world_spec.airspace`. None: everywhere. If
             its `pays` is `"seen"`, all cells within the sensor's view of the path count.

@@ -25,7 +25,7 @@ from emberwatch.errors import InvalidArgumentError, invalid
 
 
 def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
-    """Makes a vector environment for Stable-Baselines3, like `gymnasium.make_vec`.
+    """Makes a vector environment for Stable-Baselines3, as `gymnasium.make_vec` does.
 
     For episode statistics, wrap it in Stable-Baselines3's `VecMonitor`.
 

@@ -40,7 +40,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     moves the world from ``X_k`` to ``X_{k+1}``, and its frame shows ``X_{k+1}``. The filter
     predicts, then corrects. The observation is the posterior about ``X_{k+1}``, given all frames
     (eqs. 5 and 6), with the same numbers as the Rust agent's. The agent plans on the predictor, the
-    belief about the state that the next path meets. To compute it from this observation, use
+    belief about the state that the next path will observe. To compute it from this observation, use
     `emberwatch.belief.Transition`.
 
     - ``dtype="float32"``: a `Box` of 0 to 1, shape (S, H, W). The S numbers of a cell sum to 1.
@@ -50,7 +50,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
       ``"belief"``.
 
     ## Priors
-    - ``"simulated"``: how often each cell of 64 simulated worlds is in each state after the
+    - ``"simulated"``: the share of 64 simulated worlds with each cell in each state after the
       burn-in. The first simulation takes some seconds; later ones are read from
       ``~/.cache/emberwatch``.
     - ``"initial"``: the model's initial distribution, which is exact for worlds without burn-in.

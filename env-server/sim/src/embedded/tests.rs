@@ -61,7 +61,7 @@ fn a_client_flies_resets_and_recalls() {
 }
 
 #[test]
-fn a_snapshot_has_the_same_future() {
+fn a_restored_snapshot_continues_in_the_same_way() {
     let mut client = client(2, 20);
     step(&mut client).expect("a step");
     let folder = tempfile::tempdir().expect("a folder");
@@ -84,7 +84,7 @@ fn a_snapshot_has_the_same_future() {
 }
 
 #[test]
-fn refusals_are_those_of_a_server() {
+fn requests_are_refused_as_a_server_refuses_them() {
     let mut client = client(1, 20);
     let lease = client.lease();
     assert_eq!(status(client.reset(&reset(3, 1))), Status::NoSuchWorld);
@@ -100,7 +100,7 @@ fn refusals_are_those_of_a_server() {
 }
 
 #[test]
-fn a_wait_that_ended_early_leaves_the_worlds_to_the_next_one() {
+fn an_interrupted_wait_leaves_its_worlds_to_the_next_call() {
     let mut client = client(1, 100_000);
     let reset = Request::Reset {
         lease: client.lease(),

@@ -1,4 +1,5 @@
-//! Moves worlds by one step: when a request brings the last missing path, a deadline passes or a robot's holder leaves.
+//! Moves worlds by one step when a request brings the last missing path, when a deadline passes, or when a robot's
+//! holder leaves.
 
 use super::answer::Part;
 use super::barrier::{Barrier, Ticket, Waiter};
@@ -33,8 +34,9 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Returns the next answer to a request that waited, and writes its results and frames to `payload`. Call it until
-    /// `None` before the next request, because answers show the current step of their worlds.
+    /// Returns the next answer to a request that waited, and writes its results and frames to `payload`. Before the
+    /// next request is handled, call this until it returns `None`, because answers show the current step of their
+    /// worlds.
     pub fn next_answer(&mut self, payload: &mut Vec<u8>) -> Option<(Ticket, StepReply)> {
         let (waiter, outcome) = self.settled.pop_front()?;
         payload.clear();
@@ -48,7 +50,7 @@ impl Simulator {
         Some((waiter.ticket, reply))
     }
 
-    /// Returns the worlds that moved since the last call without a request that completed them.
+    /// Returns the worlds that have moved since the last call although no request completed their paths.
     pub fn take_moved(&mut self) -> Vec<usize> {
         std::mem::take(&mut self.moved)
     }
@@ -94,8 +96,8 @@ impl Simulator {
         self.places[world].barrier.is_complete(held, now)
     }
 
-    /// Moves worlds by one step with the paths that have arrived. If given, `parts` are the worlds' parts of an answer;
-    /// the thread that steps a world also writes its part.
+    /// Moves worlds by one step with the paths that have arrived. If given, `parts` contains each world's part of an
+    /// answer. The thread that steps a world also writes the world's part.
     pub(super) fn advance(
         &mut self,
         now: Instant,

@@ -42,7 +42,8 @@ impl Part<'_> {
         self.frames.fill(UNOBSERVED);
         for robot in episode.robots() {
             let seen = robot.frame().as_bytes();
-            // Equal rings give equal readings. Otherwise the inner ring's reading, which is smaller, stays.
+            // Robots that see a cell in the same ring have the same reading of it. Otherwise the reading of the inner
+            // ring is kept, which has the smaller value.
             (self.frames.iter_mut().zip(seen)).for_each(|(to, &value)| *to = value.min(*to));
         }
     }
@@ -102,7 +103,7 @@ impl Simulator {
         payload: &mut Vec<u8>,
     ) -> Result<(), Refusal> {
         let n_bytes = self.n_bytes(request);
-        // Tries to allocate the memory first: where `fit` fails to allocate, the process aborts.
+        // Tries to allocate the memory first, because the process would abort if the allocation in `fit` failed.
         let mut probe = Vec::<u8>::new();
         let n_more = n_bytes.saturating_sub(payload.capacity());
         let reserved = probe.try_reserve_exact(if n_more == 0 { 0 } else { n_bytes });
@@ -117,7 +118,8 @@ impl Simulator {
     pub(super) fn fit(&self, request: &StepRequest, payload: &mut Vec<u8>) {
         let n_bytes = self.n_bytes(request);
         if payload.capacity() < n_bytes {
-            // New zeroed memory, not a resize: the threads that write its pages are then the first to touch them.
+            // Allocates new zeroed memory instead of resizing, so that the threads that write the pages are the first
+            // to touch them.
             *payload = vec![0; n_bytes];
         } else {
             payload.resize(n_bytes, 0);
@@ -157,7 +159,8 @@ impl Simulator {
         reply
     }
 
-    /// Writes the requested robots at past steps and returns the header. `steps` holds one kept step per world.
+    /// Writes the results and frames of the requested robots at past steps, and returns the header. `steps` contains
+    /// one kept step per world.
     pub(super) fn write_past(
         &self,
         request: &StepRequest,
@@ -196,7 +199,7 @@ impl Simulator {
     }
 }
 
-/// Splits the first `n` bytes off.
+/// Splits off the first `n` bytes.
 fn take<'a>(bytes: &mut &'a mut [u8], n: usize) -> &'a mut [u8] {
     let (first, rest) = std::mem::take(bytes).split_at_mut(n);
     *bytes = rest;

@@ -28,9 +28,9 @@ pub(super) struct Barrier {
     pub ready: u64,
     /// Robots that observe every cell.
     pub full: u64,
-    /// When the world moves even if paths are missing.
+    /// The time at which the world moves even if paths are missing.
     pub deadline: Option<Instant>,
-    /// Waiting requests in the order of arrival. No robot belongs to two of them.
+    /// Waiting requests in the order of arrival. No robot belongs to two requests.
     pub waiters: Vec<Waiter>,
 }
 
@@ -45,7 +45,7 @@ impl Barrier {
         }
     }
 
-    /// Stores the paths of consecutive robots from `first` on. Each byte of `paths` is a move.
+    /// Stores the paths of consecutive robots, starting with robot `first`. Each byte of `paths` is a move.
     pub fn put(&mut self, first: usize, n_moves: usize, paths: &[u8], is_full: bool) {
         let n_robots = paths.len() / n_moves;
         let places = self.moves[first * n_moves..][..paths.len()].iter_mut();
@@ -81,14 +81,14 @@ impl Barrier {
         self.ready != 0 && (held & !self.ready == 0 || is_due)
     }
 
-    /// Starts to collect paths for the next step. Returns the requests that waited for this one.
+    /// Starts to collect paths for the next step. Returns the requests that waited for the current step.
     pub fn clear(&mut self) -> Vec<Waiter> {
         (self.ready, self.full, self.deadline) = (0, 0, None);
         std::mem::take(&mut self.waiters)
     }
 }
 
-/// Returns a mask of the `n` robots from `first` on, of at most 64.
+/// Returns a mask of the `n` robots that start with robot `first`, among at most 64 robots.
 pub(super) fn mask(first: usize, n: usize) -> u64 {
     u64::MAX.unbounded_shr(64 - n as u32) << first
 }

@@ -155,7 +155,8 @@ impl Lab {
         self.simulator.episode(0).expect("ready")
     }
 
-    /// Checks that world 0 equals one stepped directly with these masks of robots that fly, hover and are late.
+    /// Checks that world 0 equals a world that is stepped directly, given for each step the masks of the robots that
+    /// fly, hover and are late.
     fn assert_is_as_after(&self, steps: &[(u64, u64, u64)]) {
         let spec = self.simulator.spec();
         let mut expected = Episode::new(&spec.rules, 0);
@@ -190,7 +191,7 @@ fn status_and_detail(reply: &StepReply) -> (Status, u64) {
 }
 
 #[test]
-fn a_world_moves_with_the_last_path_in_whatever_order_they_come() {
+fn a_world_moves_with_its_last_path_whatever_the_order() {
     for order in [
         [0, 1, 2],
         [0, 2, 1],
@@ -213,13 +214,13 @@ fn a_world_moves_with_the_last_path_in_whatever_order_they_come() {
             let expected = tickets.map(|ticket| (ticket, Status::Ok, k + 1));
             assert_eq!(lab.answers(), expected, "in the order of arrival");
         }
-        assert!(lab.simulator.take_moved().is_empty(), "it was asked for");
+        assert!(lab.simulator.take_moved().is_empty(), "moved by requests");
         lab.assert_is_as_after(&[(0b111, 0, 0); 2]);
     }
 }
 
 #[test]
-fn one_client_with_all_robots_gives_the_same_as_three() {
+fn one_client_with_all_robots_is_equivalent_to_three() {
     let mut lab = Lab::new(Duration::ZERO);
     let lease = lab.acquire(1, 0, 6, false);
     for k in 0..2 {
@@ -237,7 +238,7 @@ fn a_robot_without_a_holder_hovers() {
 }
 
 #[test]
-fn a_path_counts_for_its_step_or_not_at_all() {
+fn a_path_is_flown_in_its_step_or_not_at_all() {
     let (mut lab, leases) = Lab::of_three(DEADLINE);
     assert_eq!(
         lab.replies(1, leases[0], (0, 1), 1),
@@ -289,16 +290,16 @@ fn without_a_deadline_a_world_waits_for_the_end_of_a_lease() {
     assert_eq!(
         lab.simulator.tick(lab.now),
         [3],
-        "who waits keeps its lease"
+        "a waiting client keeps its lease"
     );
     assert_eq!(lab.answers().len(), 2);
     lab.assert_is_as_after(&[(0b011, 0b100, 0)]);
     lab.now += LEASE - Duration::from_nanos(1);
-    assert!(lab.simulator.tick(lab.now).is_empty(), "from the answer on");
+    assert!(lab.simulator.tick(lab.now).is_empty(), "since the answer");
 }
 
 #[test]
-fn a_process_that_ends_delays_nobody_and_its_path_is_not_flown() {
+fn the_path_of_a_process_that_ended_is_dropped_without_delay() {
     let (mut lab, leases) = Lab::of_three(Duration::ZERO);
     lab.waits(1, leases[0], (0, 1), 0);
     let waiting = lab.waits(2, leases[1], (1, 1), 0);
@@ -318,11 +319,11 @@ fn a_process_that_ends_delays_nobody_and_its_path_is_not_flown() {
 }
 
 #[test]
-fn an_abandoned_request_takes_its_path_back() {
+fn an_abandoned_request_withdraws_its_path() {
     let (mut lab, leases) = Lab::of_three(DEADLINE);
     let ticket = lab.waits(1, leases[0], (0, 1), 0);
     lab.simulator.cancel_step(lab.now, ticket);
-    assert_eq!(lab.simulator.next_deadline(), None, "nobody waits");
+    assert_eq!(lab.simulator.next_deadline(), None, "no request waits");
     lab.now += DEADLINE;
     lab.simulator.tick(lab.now);
     assert!(lab.answers().is_empty());
@@ -346,7 +347,7 @@ fn a_robot_has_one_path_at_a_time() {
 }
 
 #[test]
-fn a_takeover_withdraws_the_path_and_the_world_waits_for_the_taker() {
+fn a_takeover_withdraws_the_path_and_waits_for_the_new_holder() {
     let (mut lab, leases) = Lab::of_three(Duration::ZERO);
     let first = lab.waits(1, leases[0], (0, 1), 0);
     let second = lab.waits(2, leases[1], (1, 1), 0);
@@ -360,7 +361,7 @@ fn a_takeover_withdraws_the_path_and_the_world_waits_for_the_taker() {
     assert_eq!(
         incomplete,
         (Status::Incomplete, 2),
-        "all its robots at once"
+        "it must fly all its robots at once"
     );
     let _ = taken_too;
     let both = lab.acquire(4, 0, 3, true);
@@ -379,7 +380,7 @@ fn a_client_that_loses_one_of_two_robots_flies_neither() {
     assert_eq!(lab.answers(), [(waiting, Status::LeaseLost, 3)]);
     lab.waits(2, one, (2, 1), 0);
     lab.waits(3, taken, (1, 1), 0);
-    assert_eq!(lab.replies(1, two, (0, 1), 0).0, Status::Ok, "it keeps one");
+    assert_eq!(lab.replies(1, two, (0, 1), 0).0, Status::Ok, "one is left");
     lab.assert_is_as_after(&[(0b111, 0, 0)]);
 }
 
@@ -432,7 +433,7 @@ fn a_world_is_reset_only_by_the_holder_of_all_held_robots() {
     }
     assert!(
         lab.answers().is_empty(),
-        "it waits for its own other robots"
+        "it waits for the other robots of client 1"
     );
     assert_eq!(lab.ask(1, &reset(leases[0])).status(), Status::Ok);
     assert_eq!(lab.answers(), [(waiting, Status::Resetting, 0)]);

@@ -4,7 +4,7 @@ use crate::world::WorldOutcome;
 use emberwatch_messages::control::{BeliefInfo, MAX_BELIEF_PART};
 use std::ops::Range;
 
-/// States for which every belief has space, because a learned model can have more states than the true one.
+/// Minimum number of states for which a belief has space. A learned model can have more states than the true one.
 const N_STATES: usize = 18;
 
 /// Maximum size of the data other than `f32` grids, in bytes.
@@ -27,7 +27,7 @@ struct StoredBelief {
 /// A part of a belief, as sent in one request.
 #[derive(Debug)]
 pub struct BeliefPart<'a> {
-    /// Describes the format of the bytes for other agents.
+    /// The format of the bytes, for other agents.
     pub kind: &'a str,
     /// Position of the part in the belief, in bytes.
     pub offset: u64,
@@ -99,7 +99,7 @@ impl Beliefs {
         (is_there && is_whole).then_some((info, bytes))
     }
 
-    /// Drops the beliefs of the robots of a world that was replaced.
+    /// Drops the beliefs stored for the robots of a world that was replaced.
     pub fn forget(&mut self, robots: Range<usize>) {
         self.left[robots].fill_with(|| None);
     }

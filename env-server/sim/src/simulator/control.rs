@@ -51,7 +51,7 @@ impl Simulator {
         let worlds = pending.worlds.iter();
         let worlds = worlds.map(|&world| self.world_info(world)).collect();
         let held = self.leases.robots_held(pending.lease);
-        // A burn-in longer than the lease must not end it.
+        // A burn-in that takes longer than the lease lasts must not end the lease.
         self.leases.end_wait(now, pending.lease);
         if !pending.describes_lease {
             return Some(Reply::Reset { worlds });
@@ -332,7 +332,7 @@ fn read(version: u32, text: &[u8]) -> Result<Request, Reply> {
     }
 }
 
-/// Returns the seed of the next episode for a reset without a seed. It is below 2^53, so that every JSON reader
+/// Returns the seed of the next episode if a reset gives none. The seed is below 2^53, so that every JSON reader
 /// represents it exactly.
 fn next_seed(last: &WorldOutcome) -> u64 {
     stream(last.seed, Purpose::Episode, last.episode).next_u64() >> 11

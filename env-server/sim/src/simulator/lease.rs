@@ -27,12 +27,12 @@ pub struct Lease {
     /// Identifies the lease in requests.
     pub token: u64,
     pub client: ClientId,
-    /// The robots for which it was acquired.
+    /// The robots for which the lease was acquired.
     pub robots: Range<usize>,
     /// The lease expires this long after its last use.
     pub time_to_live: Duration,
     expires: Instant,
-    /// The process that last took over one of its robots.
+    /// The process that last took over one of the lease's robots.
     taken_by: Option<u32>,
     /// Number of requests that wait for resets or for other clients' paths. The lease cannot expire meanwhile.
     n_waiting: u32,
@@ -59,7 +59,7 @@ pub struct Leases {
 struct Ended {
     token: u64,
     first_robot: usize,
-    /// The process that took over its last robot, if the lease ended by that.
+    /// The process that took over the last robot, if this ended the lease.
     taken_by: Option<u32>,
 }
 
@@ -70,7 +70,7 @@ pub struct Claim {
     pub robots: Range<usize>,
     /// Whether to take robots over from their holders.
     pub takeover: bool,
-    /// How long the lease lasts without use.
+    /// Time for which the lease lasts without use.
     pub time_to_live: Duration,
 }
 
@@ -201,7 +201,7 @@ impl Leases {
         }
     }
 
-    /// Ends a wait counted by [`Self::begin_wait`]. The lease's time without use starts again now.
+    /// Ends a wait counted by [`Self::begin_wait`]. The time that the lease lasts without use starts again at `now`.
     pub fn end_wait(&mut self, now: Instant, token: u64) {
         if let Some(lease) = self.live.get_mut(&token) {
             lease.n_waiting = lease.n_waiting.saturating_sub(1);
@@ -248,13 +248,13 @@ impl Leases {
         self.holders[robot].and_then(|token| self.live.get(&token))
     }
 
-    /// Returns a mask of the held robots, of at most 64: bit i stands for the i-th robot of the range.
+    /// Returns a mask of the held robots in a range of at most 64: bit i stands for the i-th robot of the range.
     pub fn held(&self, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
         bits(holders.map(Option::is_some))
     }
 
-    /// Returns a mask of the robots that a lease holds, of at most 64.
+    /// Returns a mask of the robots that a lease holds, in a range of at most 64.
     pub fn held_under(&self, token: u64, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
         bits(holders.map(|holder| *holder == Some(token)))
@@ -276,7 +276,7 @@ impl Leases {
         self.ended.iter().find(|ended| ended.token == token)
     }
 
-    /// Returns the refusal of a client that does not hold a robot under a lease.
+    /// Returns the refusal for a client that does not hold a robot under a lease.
     pub fn not_held(&self, token: u64, client: ClientId, robot: usize) -> Refusal {
         let is_own = |lease: &&Lease| lease.client == client && lease.robots.contains(&robot);
         let holder = self.holder(robot).map(|holder| holder.client.pid);

@@ -44,14 +44,14 @@ fn a_robot_has_one_holder() {
         .acquire(now, claim(2, 1..3, false), 12)
         .expect_err("held");
     assert_eq!(refused, Refusal::new(Status::Busy, 1));
-    assert!(leases.holder(2).is_none(), "a refused claim takes nothing");
+    assert!(leases.holder(2).is_none(), "a refused claim takes no robot");
     give(&mut leases, now, claim(2, 2..4, false), 13);
     assert_eq!(leases.use_lease(now, 11, client(1), &(0..2)), Ok(()));
     assert_eq!(leases.use_lease(now, 13, client(2), &(1..3)), no_lease(1));
 }
 
 #[test]
-fn a_takeover_costs_the_holder_the_robots_taken() {
+fn a_takeover_removes_the_robots_from_their_holder() {
     let (mut leases, now) = (Leases::new(2), Instant::now());
     give(&mut leases, now, claim(1, 0..2, false), 11);
     give(&mut leases, now, claim(2, 1..2, true), 12);
@@ -62,7 +62,7 @@ fn a_takeover_costs_the_holder_the_robots_taken() {
 }
 
 #[test]
-fn use_extends_a_lease_and_idleness_ends_it() {
+fn use_extends_a_lease_and_disuse_ends_it() {
     let (mut leases, now) = (Leases::new(1), Instant::now());
     give(&mut leases, now, claim(1, 0..1, false), 11);
     let almost = now + TTL - Duration::from_millis(1);
@@ -97,7 +97,7 @@ fn a_lost_lease_names_the_current_holder_of_its_own_robots() {
 }
 
 #[test]
-fn a_lost_lease_names_its_taker_even_after_it_left() {
+fn a_lost_lease_names_the_new_holder_even_after_it_left() {
     let (mut leases, now) = (Leases::new(3), Instant::now());
     give(&mut leases, now, claim(1, 0..3, false), 11);
     give(&mut leases, now, claim(2, 0..1, true), 12);
@@ -113,7 +113,7 @@ fn a_lost_lease_names_its_taker_even_after_it_left() {
 }
 
 #[test]
-fn a_stolen_token_is_worth_nothing() {
+fn a_stolen_token_does_not_work() {
     let (mut leases, now) = (Leases::new(1), Instant::now());
     give(&mut leases, now, claim(1, 0..1, false), 11);
     assert_eq!(leases.use_lease(now, 11, client(2), &(0..1)), no_lease(0));
@@ -123,7 +123,7 @@ fn a_stolen_token_is_worth_nothing() {
 }
 
 #[test]
-fn a_closed_connection_and_a_dead_process_hold_nothing() {
+fn a_closed_connection_and_a_dead_process_hold_no_robots() {
     let end = [
         |leases: &mut Leases| leases.end_of_nodes_except(&HashSet::from([2])),
         |leases: &mut Leases| leases.end_of_process(1),

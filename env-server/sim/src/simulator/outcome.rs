@@ -18,7 +18,7 @@ pub enum Outcome {
     Changed(Range<usize>, Reply),
     /// A file to read or write, and an answer when that is done.
     File(Job, PendingFile),
-    /// An immediate answer, then the end of the server.
+    /// An immediate answer, after which the server ends.
     Shutdown,
 }
 

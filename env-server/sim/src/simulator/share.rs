@@ -3,7 +3,7 @@
 use rayon::{Scope, ThreadPool};
 use std::sync::{Mutex, PoisonError};
 
-/// Does all jobs, on the calling thread and on the threads of a pool. Each thread takes the next job when it has
+/// Runs all jobs on the calling thread and on the threads of a pool. Each thread takes the next job when it has
 /// finished one, so that a thread that wakes up late delays no job.
 pub(super) fn share<J: Send>(
     threads: &ThreadPool,
@@ -63,7 +63,7 @@ mod tests {
     }
 
     #[test]
-    fn all_threads_take_part_the_calling_one_among_them() {
+    fn all_threads_take_part_including_the_calling_one() {
         let (seen, all) = (Mutex::new(HashSet::new()), Barrier::new(4));
         share(&pool(4), 4, 0..4, |_| {
             // Each job waits for all others, so that no thread can run two of them.

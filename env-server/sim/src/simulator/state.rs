@@ -23,9 +23,9 @@ pub struct Simulator {
     pub(super) leases: Leases,
     /// Worlds for which requests wait.
     pub(super) waiting_worlds: Vec<usize>,
-    /// Requests whose wait is over and that are not answered yet; `Err` holds a refusal.
+    /// Requests whose wait is over but which are not answered yet. `Err` contains a refusal.
     pub(super) settled: VecDeque<(Waiter, Result<(), Refusal>)>,
-    /// Worlds that moved without a request that completed them.
+    /// Worlds that moved although no request completed their paths.
     pub(super) moved: Vec<usize>,
     pub(super) n_tickets: u64,
     pub(super) threads: ThreadPool,
@@ -57,7 +57,7 @@ pub struct ResetJob {
     pub world: usize,
     /// The world's previous episode, if any.
     pub before: Option<Box<Episode>>,
-    /// Number of the new episode, which counts only if there is no previous one.
+    /// Number of the new episode. Used only if there is no previous episode.
     pub episode: u64,
     pub seed: u64,
 }

@@ -29,7 +29,7 @@ pub enum Stepped {
 
 /// How a valid request is answered.
 enum Granted<'a> {
-    /// The payload already holds the answer.
+    /// The payload already contains the answer.
     Written,
     /// The answer shows the current step of the worlds.
     Present,
@@ -108,7 +108,7 @@ impl Simulator {
     }
 
     /// Stores the paths of a checked request. Moves its worlds and writes the answer, unless the request is for one
-    /// world that still waits for other paths: then returns the ticket.
+    /// world that still waits for other paths. In that case, returns the ticket.
     fn put_paths(
         &mut self,
         now: Instant,
@@ -170,7 +170,7 @@ impl Simulator {
         ticket
     }
 
-    /// Checks that the history of each world holds the requested step.
+    /// Checks that the history of each world contains the requested step.
     fn check_kept(&self, worlds: Range<usize>, steps: &[u8]) -> Result<(), Refusal> {
         let mut episodes = worlds
             .filter_map(|world| self.episode(world))
@@ -220,7 +220,7 @@ impl Simulator {
         Ok(())
     }
 
-    /// Checks that no path of these robots is waiting. A client with two ports could send a second path.
+    /// Checks that no path of these robots is waiting. A client with two ports could otherwise send a second path.
     fn check_new(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
         for world in self.worlds_of(robots) {
             let own = within(robots, self.robots_of(world));

@@ -70,7 +70,7 @@ fn status_of(simulator: &mut Simulator, now: Instant, what: Operation, body: &[u
 }
 
 #[test]
-fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
+fn a_world_in_burn_in_refuses_steps_and_delays_other_requests() {
     let ((mut simulator, jobs), now) = (start(), Instant::now());
     let (_, acquired) = wait(&mut simulator, now, ACQUIRE);
     assert_eq!(simulator.pending_reply(now, &acquired), None);
@@ -86,7 +86,7 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
     let observed = status_of(&mut simulator, now, Operation::Observe, &[]);
     assert_eq!(observed, Status::Resetting);
     let Outcome::Answer(twice) = ask(&mut simulator, now, RESET) else {
-        panic!("one reset of a world at a time");
+        panic!("a world can have only one reset at a time");
     };
     assert_eq!(twice.status(), Status::Resetting);
     finish(&mut simulator, jobs);

@@ -71,7 +71,7 @@ impl Simulator {
         }
     }
 
-    /// Replaces the worlds of a restore request by the worlds read from its file.
+    /// Replaces the worlds of a restore request with the worlds read from its file.
     fn finish_restore(
         &mut self,
         now: Instant,
@@ -220,7 +220,7 @@ impl Simulator {
         }))
     }
 
-    /// Checks that a client may replace worlds under a lease, and that none of them is in a reset.
+    /// Checks that a client may replace worlds under a lease, and that none of them is being reset.
     fn check_replaceable(
         &mut self,
         now: Instant,
@@ -259,7 +259,7 @@ fn absolute(path: String) -> Result<PathBuf, Reply> {
     )))
 }
 
-/// Returns the answer to a snapshot request, with the worlds as they were written.
+/// Returns the answer to a snapshot request, which describes the worlds as they were written.
 fn saved(pending: &PendingFile, path: &Path, n_bytes: usize) -> Reply {
     let PendingFile::Saved(worlds) = pending else {
         return malformed("expected a pending snapshot, got a pending restore");

@@ -14,7 +14,7 @@ pub enum SnapshotError {
 }
 
 impl SnapshotError {
-    /// Creates the error of a file with the wrong number of worlds.
+    /// Creates the error for a file with the wrong number of worlds.
     pub fn n_worlds(expected: impl ToString, got: usize) -> Self {
         let expected = expected.to_string();
         Self::Unfit(format!("worlds: expected {expected}, got {got}"))

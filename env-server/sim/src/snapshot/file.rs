@@ -34,7 +34,8 @@ pub struct FileError {
 pub enum Durability {
     /// The death of any process.
     Kill,
-    /// Also a loss of power, because the data has reached the disk. This takes some milliseconds.
+    /// The death of any process and a loss of power, because the data has reached the disk. This takes some
+    /// milliseconds.
     PowerLoss,
 }
 
@@ -80,7 +81,7 @@ pub fn read(path: &Path) -> Result<Snapshot, FileError> {
     snapshot.map_err(|error| refused(path, error))
 }
 
-/// Creates the error of a file whose contents are refused.
+/// Creates the error for a file whose contents are refused.
 pub fn refused(path: &Path, error: SnapshotError) -> FileError {
     FileError {
         path: path.display().to_string(),
@@ -89,7 +90,7 @@ pub fn refused(path: &Path, error: SnapshotError) -> FileError {
     }
 }
 
-/// Creates a new file. Anything that has its name, such as a link or a pipe, is removed and not opened.
+/// Creates a new file. Anything else with this name, such as a link or a pipe, is removed without being opened.
 pub(super) fn create(path: &Path) -> io::Result<File> {
     match std::fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
@@ -102,7 +103,7 @@ pub(super) fn create(path: &Path) -> io::Result<File> {
     options.open(path)
 }
 
-/// Checks that the path is free or holds a snapshot: other files, devices and links must not be replaced.
+/// Checks that no file or a snapshot exists at the path. Other files, devices and links must not be replaced.
 fn may_be_replaced(path: &Path) -> io::Result<()> {
     if path.file_name().is_none() {
         return Err(io::Error::other(NOT_A_FILE));

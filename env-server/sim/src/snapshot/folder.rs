@@ -19,7 +19,7 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// Names the folder and the instance without reading the folder.
+    /// Represents an instance's snapshots in a folder. Does not read the folder.
     pub fn new(path: &Path, instance: &Instance) -> Self {
         Self {
             path: path.into(),
@@ -37,7 +37,7 @@ impl Folder {
         made.map_err(|error| failed(&self.path, error))
     }
 
-    /// Creates the error that new snapshots would gradually replace those of an earlier run.
+    /// Creates the error for a folder with snapshots of an earlier run, which new snapshots would gradually replace.
     pub fn not_empty(&self, n_files: usize) -> FileError {
         let instance = &self.instance;
         FileError {
@@ -101,7 +101,8 @@ impl Folder {
         names
     }
 
-    /// Writes the next file. Removes all others except the latest `keep` files, the new one included, and `also_keep`.
+    /// Writes the next file. Then removes all files except `also_keep` and the latest `keep` files, which include the
+    /// new one.
     pub fn save(
         &self,
         bytes: &[u8],

@@ -1,4 +1,4 @@
-//! The format of snapshots: everything that decides the worlds' future, with a version and a checksum.
+//! The format of snapshots: everything that determines the worlds' future, with a version and a checksum.
 //!
 //! A file consists of [`MAGIC`], the version, the CRC-32 of the body, the length of the body, and the body:
 //! [`Settings`] and worlds, encoded by bincode. The byte order is the host's. A file in the other byte order appears to
@@ -150,11 +150,13 @@ fn check_size(n_bytes: u64) -> Result<(), SnapshotError> {
     )))
 }
 
-/// The body of a file: settings, and for each world its seed, episode number and, after its burn-in, its state.
+/// The body of a file: settings, and the seed and episode number of each world, followed by its state if its burn-in is
+/// finished.
 type Contents = (Settings, Vec<(u64, u64, Option<DecodedWorld>)>);
 
-/// Decodes a body, and returns the contents and the number of bytes read. The limit of bincode's allocations is a
-/// constant in its type, so that this picks the smallest sufficient limit: a small file cannot claim much memory.
+/// Decodes a body, and returns the contents and the number of bytes read. Limits bincode's allocations, so that a small
+/// file cannot claim much memory. The limit is a constant in a type of bincode, so this function chooses the smallest
+/// sufficient constant.
 fn decode_body(body: &[u8]) -> Result<(Contents, usize), DecodeError> {
     match body.len() {
         0..0x1_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x10_0000>()),

@@ -14,17 +14,17 @@ use std::path::{Path, PathBuf};
 pub enum Job {
     /// Writes a snapshot.
     Save { path: PathBuf, bytes: Vec<u8> },
-    /// Writes the next of the server's automatic snapshots.
+    /// Writes the server's next automatic snapshot.
     Autosave {
         folder: Folder,
         durability: Durability,
         /// Number of files to keep.
         keep: usize,
-        /// A further file to keep.
+        /// Another file to keep.
         also_keep: Option<PathBuf>,
         bytes: Vec<u8>,
     },
-    /// Reads worlds of a snapshot.
+    /// Reads worlds from a snapshot.
     Load { path: PathBuf, worlds: Range<usize> },
 }
 
@@ -61,7 +61,7 @@ impl Job {
     }
 }
 
-/// Reads worlds of a file, all of them if `worlds` is `None`.
+/// Reads worlds from a file, or all worlds if `worlds` is `None`.
 pub fn load(
     spec: &WorldSpec,
     path: &Path,

@@ -8,7 +8,7 @@ use emberwatch_model::ModelError;
 use sha2::{Digest, Sha256};
 use std::fmt::Display;
 
-/// Key of the task's name: the last setting, present only if a task set the worlds' settings.
+/// Key of the task's name. This setting comes last, and only if a task determines the worlds' settings.
 const TASK: &str = "task";
 
 /// Version of the dynamics. Increased when equal settings and seeds yield a different trajectory or different rewards.
@@ -93,7 +93,7 @@ impl Settings {
     /// Returns 16 hexadecimal digits that identify the worlds. Results are comparable only if these digits are equal.
     ///
     /// The hash covers the model or the recorded states, grid, moves, robots, start, burn-in and whether robots see
-    /// every cell. It omits the task's name and `max_steps`, because a result has its own number of steps.
+    /// every cell. It omits the task's name and `max_steps`, because each result states its number of steps.
     pub fn worlds_fingerprint(&self) -> String {
         let mut hash = Sha256::new();
         hash.update(format!("worlds {WORLDS}\n{}\n", self.model));

@@ -57,7 +57,7 @@ fn bytes(settings: &Settings, episodes: &[Episode]) -> Vec<u8> {
 }
 
 #[test]
-fn what_is_read_is_what_was_written() {
+fn a_snapshot_is_read_as_it_was_written() {
     let spec = spec();
     let written = bytes(&spec.settings, &episodes(&spec.rules));
     let snapshot = decode(&written).expect("a snapshot");
@@ -73,7 +73,7 @@ fn what_is_read_is_what_was_written() {
 }
 
 #[test]
-fn every_cut_and_every_changed_byte_is_noticed() {
+fn every_truncation_and_every_changed_byte_is_detected() {
     let spec = spec();
     let mut bytes = bytes(&spec.settings, &episodes(&spec.rules));
     for at in 0..bytes.len() {
@@ -100,7 +100,7 @@ fn every_cut_and_every_changed_byte_is_noticed() {
     assert_eq!(refusal(header, &longer), words);
     let words = "malformed: 1 bytes after the last world";
     assert_eq!(sealed(&longer), words);
-    // A claimed length that exceeds any memory.
+    // The header claims a length that exceeds any memory.
     let claims = [&u64::MAX.to_ne_bytes(), &body[8..]].concat();
     let said = sealed(&claims);
     assert!(said.starts_with("malformed: "), "{said}");
@@ -148,7 +148,7 @@ const MISFITS: &[(Change, &str)] = changes! { world:
 const CLOSED: Cell = Cell { row: 2, col: 0 };
 
 #[test]
-fn a_world_that_cannot_be_is_refused() {
+fn an_impossible_world_is_refused() {
     let mut spec = spec();
     let bytes = bytes(&spec.settings, &episodes(&spec.rules));
     let closed = Grid::from_shape_fn((3, 5), |at| at == (CLOSED.row, CLOSED.col));

@@ -23,7 +23,7 @@ pub struct Episode {
     beginning: World,
     robots: Vec<Robot>,
     outcome: WorldOutcome,
-    /// A buffer for [`pay`], which holds 0 for each cell between calls.
+    /// A buffer for [`pay`], which is 0 for each cell between calls.
     counts: Vec<u8>,
     scratch: Scratch,
     history: History,
@@ -94,7 +94,8 @@ impl Episode {
     /// Returns the outcomes and frames of step k.
     ///
     /// # Errors
-    /// If the history does not hold step k. The error is the nearest step that it holds: the oldest or the current one.
+    /// If the history does not contain step k. The error is the nearest step that it contains: the oldest or the
+    /// current one.
     pub fn recall(&self, step: u64) -> Result<&PastStep, u64> {
         let oldest = self.history.all().next().map(|past| past.outcome.step);
         let present = self.outcome.step;
@@ -124,12 +125,12 @@ impl Episode {
         self.beginning.states()
     }
 
-    /// Returns the steps in the history, the oldest first.
+    /// Returns the steps in the history, from the oldest to the current one.
     pub fn history(&self) -> impl ExactSizeIterator<Item = &PastStep> {
         self.history.all()
     }
 
-    /// Restores a saved episode. It continues bit for bit like the original.
+    /// Restores a saved episode. It continues exactly as the original does, bit for bit.
     pub fn restore(rules: &Rules, saved: SavedWorld) -> Result<Self, InvalidWorld> {
         saved.check(rules)?;
         let SavedWorld {

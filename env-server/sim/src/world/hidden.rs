@@ -1,8 +1,8 @@
 //! The hidden states of one world: a pure function of (model or recorded sequences, seed, k).
 //!
-//! A simulated world starts from the model's initial distribution and runs `burn_in` steps; the state it reaches is
-//! k = 0. Its absolute step `burn_in + k` indexes the random streams, so that a world with burn-in B at step k equals a
-//! world without burn-in at step B + k.
+//! A simulated world starts from the model's initial distribution and runs `burn_in` steps, which lead to k = 0. Its
+//! absolute step `burn_in + k` indexes the random streams, so that a world with burn-in B at step k equals a world
+//! without burn-in at step B + k.
 
 use super::recorded::Recorded;
 use emberwatch_model::{Dynamics, Grid};

@@ -18,7 +18,7 @@ pub struct History {
     steps: VecDeque<PastStep>,
 }
 
-/// Returns the size in bytes of `n_steps` steps, if each of `n_robots` paths shows up to `most_seen` cells.
+/// Returns the size in bytes of `n_steps` steps, in which each of `n_robots` paths shows up to `most_seen` cells.
 pub fn bytes_of_history(n_steps: usize, n_robots: usize, most_seen: usize) -> usize {
     let of_robot = size_of::<PastRobot>() + 5 * most_seen;
     let of_step = size_of::<PastStep>() + n_robots * of_robot;
@@ -46,7 +46,8 @@ pub struct PastRobot {
 }
 
 impl History {
-    /// Creates a history for `n_steps` steps, at least one, if each of `n_robots` paths shows up to `most_seen` cells.
+    /// Creates a history for `n_steps` steps (at least one), in which each of `n_robots` paths shows up to `most_seen`
+    /// cells.
     pub fn new(n_steps: usize, n_robots: usize, most_seen: usize) -> Self {
         let n_steps = n_steps.max(1);
         Self {
@@ -57,7 +58,7 @@ impl History {
         }
     }
 
-    /// Appends a step, and drops the oldest ones while the history exceeds its capacity.
+    /// Appends a step, and drops the oldest steps while the history exceeds its capacity.
     pub fn push(&mut self, outcome: &WorldOutcome, robots: &[Robot]) {
         let mut past = self.evict_if_full().unwrap_or_default();
         past.outcome = *outcome;
@@ -68,7 +69,8 @@ impl History {
         self.keep(past);
     }
 
-    /// Appends a step that is already in sparse form, and drops the oldest ones while the history exceeds its capacity.
+    /// Appends a step that is already in sparse form, and drops the oldest steps while the history exceeds its
+    /// capacity.
     pub fn keep(&mut self, past: PastStep) {
         self.n_bytes += past.n_bytes();
         self.steps.push_back(past);
@@ -95,7 +97,7 @@ impl History {
         self.n_bytes
     }
 
-    /// Returns the kept steps, the oldest first.
+    /// Returns the kept steps, from the oldest to the current one.
     pub fn all(&self) -> impl ExactSizeIterator<Item = &PastStep> {
         self.steps.iter()
     }
@@ -143,8 +145,8 @@ impl PastRobot {
         self.values.extend(seen.map(|it| bytes[it.cell]));
     }
 
-    /// Writes the observations into `frame`, one byte per cell. Unobserved cells keep their value. Where `frame`
-    /// already holds an observation, the smaller value stays: the one from the inner sensor ring.
+    /// Writes the observations into `frame`, one byte per cell. Unobserved cells keep their value. If `frame` already
+    /// contains an observation of a cell, the smaller value is kept, because it comes from the inner sensor ring.
     pub fn write_over(&self, frame: &mut [u8]) {
         if self.cells.is_empty() && !self.values.is_empty() {
             frame.copy_from_slice(&self.values);
@@ -167,7 +169,7 @@ mod tests {
     use emberwatch_model::{Model, Move, Shape};
 
     #[test]
-    fn the_last_frames_are_kept_as_they_were() {
+    fn the_last_frames_are_kept_unchanged() {
         let shape = Shape::new(4, 6).expect("test shape");
         let rules = Rules::new(&Model::wildfire(), shape, 100, 0, Start::Corner);
         let mut rules = rules.expect("valid model");

@@ -2,7 +2,7 @@
 
 use emberwatch_model::{Cell, Coverage};
 
-/// A world's result of a step or a reset, including the sums over its robots.
+/// The result of a step or a reset for a world, including the sums over its robots.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct WorldOutcome {
     /// Step index k after the step; 0 after a reset.
@@ -11,11 +11,12 @@ pub struct WorldOutcome {
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of the rewards of the distinct rewarded cells, by their states in X_{k+1}.
+    /// Sum of the rewards of the distinct rewarded cells, which depend on the cells' states in X_{k+1}.
     pub reward: f64,
-    /// Bit r is set if no client held robot r: it stayed and observed nothing.
+    /// Bit r is set if no client held robot r. Such a robot stays in its cell and observes nothing.
     pub hovered: u64,
-    /// Bit r is set if robot r was held but its path missed the deadline: it stayed and observed nothing.
+    /// Bit r is set if robot r was held but its path missed the deadline. Such a robot stays in its cell and observes
+    /// nothing.
     pub late: u64,
     /// Number of cells of the whole grid in the state with the highest reward.
     pub n_target_cells: u32,
@@ -29,7 +30,7 @@ pub struct WorldOutcome {
     pub is_truncated: bool,
 }
 
-/// A robot's result of a step, or its position after a reset.
+/// The result of a step for a robot, or its position after a reset.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RobotOutcome {
     /// The robot's share of the world's reward: each of v robots that visited a cell gets 1/v of the cell's reward.

@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn symmetries_are_those_of_the_square() {
+    fn symmetries_are_the_eight_of_a_square() {
         let states = array![[1, 2], [3, 4]];
         let expected = [
             [[1, 2], [3, 4]],

@@ -1,15 +1,16 @@
-//! The rewards of a step. A cell that several robots visit counts once; under `Pays::Seen`, a cell that they see.
+//! The rewards of a step. A cell that several robots visit counts once. Under `Pays::Seen`, the cells that robots see
+//! count instead.
 
 use super::outcome::WorldOutcome;
 use super::robot::Robot;
 use super::rules::Rules;
 use emberwatch_model::Pays;
 
-/// Flag in a cell's count: the team has received this cell's reward.
+/// Flag in a cell's count, set once the team has received the cell's reward.
 const PAID: u8 = 0x80;
 
 /// Computes the rewards of a step from `states`, X_{k+1}: each robot's share and marginal reward, and the team's total.
-/// `counts` must hold 0 for each cell, and holds 0 again on return.
+/// `counts` must be 0 for each cell, and is 0 again on return.
 pub(super) fn pay(
     rules: &Rules,
     states: &[u8],
@@ -75,7 +76,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     #[test]
-    fn shares_and_marginal_rewards_are_those_of_sets_of_cells() {
+    fn shares_and_marginal_rewards_match_sums_over_sets_of_cells() {
         let shape = Shape::new(4, 5).expect("shape");
         let rules = Rules::new(&Model::wildfire(), shape, 0, 0, Start::Random);
         let mut rules = rules.expect("valid model");

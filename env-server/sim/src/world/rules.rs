@@ -1,4 +1,5 @@
-//! The rules that all episodes of a server share: the model, the grid, and the settings that decide a world's future.
+//! The rules that all episodes of a server share: the model, the grid, and the settings that determine a world's
+//! future.
 
 use super::hidden::Source;
 use super::recorded::Recorded;
@@ -17,7 +18,7 @@ use std::sync::atomic::AtomicBool;
 pub struct Rules {
     pub shape: Shape,
     pub airspace: Airspace,
-    /// Row-major indices of the possible random starts; `None`: all cells.
+    /// Row-major indices of the possible random starts, or `None` if every cell is possible.
     starts: Option<Arc<Vec<usize>>>,
     /// Reward of a distinct visited (or seen) cell, by the cell's state.
     pub reward: Vec<f64>,
@@ -29,7 +30,7 @@ pub struct Rules {
     pub n_observations: usize,
     /// Number of steps simulated before k = 0.
     pub burn_in: u64,
-    /// Episode length; 0: never truncated.
+    /// Episode length in steps. If it is 0, episodes are never truncated.
     pub max_steps: u64,
     pub start: Start,
     /// Number of steps whose frames are kept.
@@ -74,7 +75,7 @@ impl Rules {
         })
     }
 
-    /// Replaces the simulation by recorded hidden states.
+    /// Replaces the simulation with recorded hidden states.
     pub fn with_recorded(mut self, recorded: Arc<Recorded>) -> Self {
         self.source = Source::Recorded(recorded);
         self

@@ -1,4 +1,4 @@
-//! Worlds read from a file, and the checks that an episode relies on.
+//! Worlds read from a file, and the checks on which an episode relies.
 
 use super::history::{PastRobot, PastStep};
 use super::outcome::{RobotOutcome, WorldOutcome};
@@ -10,24 +10,24 @@ use thiserror::Error;
 /// Maximum step index k and maximum episode number, small enough that no sum overflows.
 const MAX_COUNT: u64 = 1 << 62;
 
-/// A saved world: everything that decides its future, and the latest outcomes and frames.
+/// A saved world: everything that determines its future, and the latest outcomes and frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedWorld {
-    /// The world's outcome of the last step, with seed, episode number and k.
+    /// The world's outcome of the last step, which contains the seed, the episode number and k.
     pub outcome: WorldOutcome,
     /// Hidden states, row-major.
     pub states: Vec<u8>,
     /// Hidden states at k = 0, row-major.
     pub first_states: Vec<u8>,
     pub robots: Vec<SavedRobot>,
-    /// The kept steps, the oldest first.
+    /// The kept steps, from the oldest to the current one.
     pub history: Vec<PastStep>,
 }
 
 /// One robot of a saved world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedRobot {
-    /// The robot's outcome of the last step, with its position.
+    /// The robot's outcome of the last step, which contains its position.
     pub outcome: RobotOutcome,
     pub frame: Vec<u8>,
     pub path: Vec<u8>,
@@ -39,7 +39,7 @@ pub struct SavedRobot {
 pub struct InvalidWorld(pub String);
 
 impl SavedWorld {
-    /// Checks everything that an episode relies on.
+    /// Checks every value on which an episode relies.
     pub fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
         let n_cells = rules.shape.n_cells();
         for (what, states) in [

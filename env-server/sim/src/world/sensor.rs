@@ -1,8 +1,8 @@
 //! Observation noise: draws a sensor's reading of each observed cell (paper eq. 1).
 //!
-//! A reading is a pure function of (seed, step, cell, ring), so that two agents which observe the same cell in the same
-//! step and ring get the same reading. One ChaCha8 draw keys the step, and SplitMix64 of that key yields each cell's
-//! random number. The cost is constant per observed cell, and zero for other cells.
+//! A reading is a pure function of (seed, step, cell, ring), so two agents that observe the same cell in the same step
+//! and ring get the same reading. One ChaCha8 draw gives the key of the step. SplitMix64 with this key generates each
+//! cell's random number. The cost is constant per observed cell, and zero for other cells.
 
 use emberwatch_model::SeenCell;
 use emberwatch_model::randomness::{Purpose, split_mix, stream};
@@ -65,7 +65,8 @@ impl Sensor {
             let number = split_mix(key, cell as u64) >> 32;
             let row = usize::from(states[cell]) * self.n_rings + usize::from(ring);
             let of_state = &self.thresholds[row * self.n_named..][..self.n_named];
-            // Counts over all thresholds: an early stop would mispredict a branch at every latent cell.
+            // Counts over all thresholds, because a loop that stops early would mispredict a branch at every latent
+            // cell.
             let passed = of_state.iter().filter(|threshold| number >= **threshold);
             let reading = passed.count() + usize::from(ring) * self.n_named;
             frame.observe(cell, reading as u8);
@@ -84,7 +85,7 @@ mod tests {
     use emberwatch_model::Shape;
 
     #[test]
-    fn readings_follow_the_observation_matrix_whatever_other_cells_are_observed() {
+    fn readings_follow_the_matrix_whatever_else_is_observed() {
         let sensor = Sensor::new(&Model::wildfire());
         let shape = Shape::new(100, 100).expect("shape");
         let matrix = [

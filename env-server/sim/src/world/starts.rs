@@ -6,7 +6,7 @@ use emberwatch_model::{Airspace, Cell, Shape};
 use std::collections::BTreeSet;
 use std::fmt::{Display, Formatter};
 
-/// The free cells that the robots of a world can reach in spite of no-fly cells.
+/// The free cells that the robots of a world can reach despite no-fly cells.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Reach {
     /// Number of free cells.
@@ -29,7 +29,7 @@ impl Reach {
     /// Checks that `n_robots` robots can start in an airspace and leave their start cells.
     ///
     /// # Errors
-    /// If a start is a no-fly cell or cannot be left. The error holds the texts after "expected" and "got".
+    /// If a start is a no-fly cell or cannot be left. The error contains the texts after "expected" and "got".
     pub fn of(start: Start, airspace: &Airspace, n_robots: usize) -> Result<Self, [String; 2]> {
         if airspace.is_open() {
             let n_free = airspace.shape().n_cells();
@@ -116,7 +116,7 @@ pub(super) fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Ce
     }
 }
 
-/// Returns a corner or the middle of a side. The first eight robots get different ones.
+/// Returns a corner or the middle of a side. These cells differ between the first eight robots.
 fn corner_or_side(shape: Shape, robot: usize) -> Cell {
     let (bottom, right) = (shape.height() - 1, shape.width() - 1);
     let places = [
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn fixed_starts_in_a_pocket_are_named_with_what_they_reach() {
+    fn enclosed_fixed_starts_are_named_with_the_cells_they_reach() {
         let shape = Shape::new(3, 6).expect("a shape");
         let pocket = model(["..#...", "###...", "......"]).airspace(shape);
         let pocket = pocket.expect("the grid");
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_connected_map_has_the_random_starts_of_all_free_cells() {
+    fn random_starts_on_a_connected_map_are_all_free_cells() {
         let rows = [".#....", ".####.", "......"];
         let shape = Shape::new(3, 6).expect("a shape");
         let rules = Rules::new(&model(rows), shape, 0, 0, Start::Random).expect("rules");

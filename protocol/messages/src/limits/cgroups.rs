@@ -1,8 +1,9 @@
-//! The limits of the cgroups (versions 1 and 2) of this process: its container's, and those of the cgroups around it.
+//! The limits that cgroups (versions 1 and 2) set for this process. The process's cgroup and all enclosing cgroups can
+//! set limits.
 
 use std::path::{Path, PathBuf};
 
-/// Values from this on mean "no limit": version 1 writes the largest multiple of a page.
+/// Values of at least this mean "no limit": version 1 writes the largest multiple of the page size.
 const UNLIMITED: u64 = 1 << 60;
 
 /// A controller of cgroups. Its files have one name in version 1 and another in version 2.
@@ -12,7 +13,7 @@ pub(super) struct Controller {
     pub(super) limit: [&'static str; 2],
     /// The file with the current use.
     pub(super) used: [&'static str; 2],
-    /// Counts in `memory.stat` that the kernel can reclaim, such as cached files.
+    /// Entries of `memory.stat` that count reclaimable memory, such as cached files.
     pub(super) reclaimable: [&'static [&'static str]; 2],
 }
 
@@ -125,7 +126,8 @@ mod tests {
     };
 
     /// Checks the limits found in a system with these files. Each line of `files` is one file, with `;` at the end of
-    /// its lines. An expected limit has the folder, the limit and the free amount, from the innermost cgroup outward.
+    /// its lines. Each expected limit consists of the folder, the limit and the free amount, from the innermost cgroup
+    /// outward.
     fn check(name: &str, files: &str, expected: &[&str]) {
         let root = std::env::temp_dir().join(format!("emberwatch-{name}-{}", std::process::id()));
         for line in files.trim().lines() {
@@ -144,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn all_groups_around_a_process_count_in_version_2() {
+    fn version_2_includes_all_enclosing_groups() {
         let outer = "
             proc/self/cgroup = 0::/outer/inner;
             proc/self/mountinfo = 30 23 0:26 / /sys/fs/cgroup rw,nosuid - cgroup2 cgroup2 rw,nsdelegate
@@ -170,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_group_is_found_below_the_top_of_a_mount_in_version_1() {
+    fn version_1_finds_a_group_below_the_top_of_a_mount() {
         let mounts = [
             "34 31 0:31 / /sys/fs/cgroup/cpuset rw - cgroup cgroup rw,cpuset",
             "35 31 0:32 /docker/id /sys/fs/cgroup/memory rw,relatime shared:9 - cgroup cgroup rw,memory",

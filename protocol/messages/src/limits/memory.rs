@@ -17,7 +17,7 @@ const CGROUP: Controller = Controller {
     ],
 };
 
-/// The error for more memory than is available.
+/// The error for a request for more memory than is available.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("memory: expected {} for {what}, got {got}", in_words(*.needed))]
 pub struct NoMemory {
@@ -41,7 +41,7 @@ struct Limit {
 /// If the machine, a cgroup or a `ulimit` has less memory.
 pub fn check(what: impl Display, n_bytes: u64) -> Result<(), NoMemory> {
     check_below(Path::new("/"), &what, n_bytes)?;
-    // Some limits are in no file, such as those on an overcommitted system.
+    // Some limits appear in no file, such as those of an overcommitted system.
     let mut probe = Vec::<u8>::new();
     let reserved = usize::try_from(n_bytes).map(|n_bytes| probe.try_reserve_exact(n_bytes));
     match reserved {
@@ -60,7 +60,7 @@ pub fn refused(what: impl Display, n_bytes: u64) -> NoMemory {
     check_below(Path::new("/"), &what, n_bytes).map_or_else(|error| error, none)
 }
 
-/// Allocates an empty vector whose capacity comes from outside.
+/// Allocates an empty vector whose capacity depends on external input.
 ///
 /// # Errors
 /// If there is not enough memory.
@@ -73,7 +73,7 @@ pub fn with_capacity<T>(what: impl Display, capacity: usize) -> Result<Vec<T>, N
     }
 }
 
-/// Checks like [`check`], with the limits in the files below `root`.
+/// Checks as [`check`] does, but reads the limits from the files below `root`.
 fn check_below(root: &Path, what: &impl Display, needed: u64) -> Result<(), NoMemory> {
     let limits = limits(root).into_iter();
     let tightest = limits.min_by_key(|limit| limit.free);
@@ -117,7 +117,7 @@ fn of_machine(root: &Path) -> Option<Limit> {
     })
 }
 
-/// Returns no limits of `ulimit`: they are unknown on other systems, like those of cgroups and `/proc`.
+/// Returns no limits: outside Linux, limits of `ulimit`, cgroups and `/proc` are unknown.
 #[cfg(not(target_os = "linux"))]
 fn of_process(_root: &Path) -> Vec<Limit> {
     Vec::new()
@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_does_not_fit_is_refused_with_numbers() {
+    fn a_refusal_for_too_much_memory_states_the_numbers() {
         let check_refused = |error: String, expected: &str| {
             assert!(error.starts_with(expected), "{error}");
         };
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn kib_are_read_by_their_names() {
+    fn a_number_of_kib_is_read_by_its_name() {
         let text = "MemTotal:       16 kB\nMemAvailable:   4 kB\n";
         assert_eq!(kib(text, "MemAvailable:"), Some(4096));
         assert_eq!(kib(text, "MemFree:"), None);

@@ -13,7 +13,7 @@ use thiserror::Error;
 /// The first bytes of every recording.
 pub const MAGIC: [u8; 8] = *b"EMBERREC";
 
-/// Version of the format. A file in the other byte order has another number here, and is rejected.
+/// Version of the format. A file in the other byte order has a different value here, and is rejected.
 pub const VERSION: u32 = 2;
 
 /// Maximum size of a body before compression in bytes: the largest frames and the longest paths of the largest team.
@@ -31,7 +31,7 @@ pub struct FileHeader {
     pub magic: [u8; 8],
     /// [`VERSION`].
     pub version: u32,
-    /// 0.
+    /// Reserved; always 0.
     pub reserved: u32,
 }
 
@@ -87,7 +87,7 @@ pub enum Event {
     Truth(Sample<TruthHeader>),
 }
 
-/// The contents of a recording, and its losses while recording.
+/// The numbers of records in a recording, and of samples that its recorder missed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Totals {
     /// Number of servers.
@@ -102,7 +102,7 @@ pub struct Totals {
     pub n_lost_truths: u64,
 }
 
-/// The reason why a recording cannot be written, or not be read further.
+/// The reason why a recording cannot be written, or cannot be read any further.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecordingError {
@@ -138,7 +138,7 @@ pub enum RecordingError {
         /// Number of world steps before it.
         n_steps: u64,
     },
-    /// A record is invalid at this point, so it was not written.
+    /// A record does not fit the previous records, so it was not written.
     #[error("not recorded: {0}")]
     Refused(String),
 }

@@ -10,8 +10,8 @@ use emberwatch_model::path::MAX_MOVES;
 use std::collections::HashMap;
 use std::fmt::Display;
 
-/// The contents of the records so far. Writer and reader both keep it, so that neither accepts a record that the other
-/// would reject.
+/// The state after the records so far. The writer and the reader both track it, so that neither accepts a record that
+/// the other would reject.
 #[derive(Debug, Default)]
 pub(super) struct Progress {
     pub(super) nanos: u64,
@@ -37,7 +37,7 @@ impl Progress {
     /// Checks and counts a record.
     ///
     /// # Errors
-    /// If the record is invalid after the records before it. The error has the expected value.
+    /// If the record does not fit the previous records. The error contains the expected value.
     pub(super) fn accept(&mut self, record: &Record) -> Result<(), String> {
         if record.nanos < self.nanos {
             let (expected, got) = (self.nanos, record.nanos);

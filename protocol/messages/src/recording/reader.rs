@@ -13,7 +13,7 @@ use std::io::Read;
 
 /// A reader of a recording: an iterator of records that ends after the first error.
 ///
-/// A file without an end yields [`RecordingError::Cut`] after its last complete record. A damaged file yields
+/// A file without an end record yields [`RecordingError::Cut`] after its last complete record. A damaged file yields
 /// [`RecordingError::Damaged`] at the first damaged record.
 #[derive(Debug)]
 pub struct Reader<R> {
@@ -25,7 +25,7 @@ pub struct Reader<R> {
 }
 
 impl<R: Read> Reader<R> {
-    /// Begins to read. `input` should be buffered, and at the beginning of the file.
+    /// Begins to read a recording. `input` should be buffered, and positioned at the beginning of the file.
     ///
     /// # Errors
     /// If the file is not a recording, has another version, or is shorter than a header.
@@ -66,7 +66,7 @@ impl<R: Read> Reader<R> {
         })
     }
 
-    /// Returns the contents that were read so far.
+    /// Returns the totals of the records read so far.
     pub fn totals(&self) -> Totals {
         self.progress.totals
     }
@@ -94,7 +94,7 @@ impl<R: Read> Reader<R> {
             let problem = format!("body: expected at most {MAX_STORED_BYTES} bytes, got {length}");
             return Err(damaged(problem));
         }
-        // The buffer grows as bytes arrive, so a false length does not allocate memory.
+        // The buffer grows as bytes arrive, so a wrong length cannot cause a large allocation.
         self.stored.clear();
         let mut body = (&mut self.input).take(length as u64);
         body.read_to_end(&mut self.stored)?;

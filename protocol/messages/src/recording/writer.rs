@@ -9,10 +9,11 @@ use flate2::{Compress, Compression, FlushCompress, Status};
 use std::io::Write;
 
 /// The compression level. A frame of 64 x 64 cells and 64 moves takes 153 bytes and 15 us, hidden states 651 bytes and
-/// 48 us. Level 1 takes 207 and 1,025 bytes in the same time, level 6 146 and 560 bytes in five times as long.
+/// 48 us. Level 1 takes 207 and 1,025 bytes and the same time. Level 6 takes 146 and 560 bytes, but five times as long.
 const LEVEL: u32 = 2;
 
-/// A writer of a recording. A recording without [`Self::finish`] has no end, which readers report as an error.
+/// A writer of a recording. Call [`Self::finish`] at the end: readers report an error for a recording without an end
+/// record.
 #[derive(Debug)]
 pub struct Writer<W> {
     output: W,
@@ -48,8 +49,8 @@ impl<W: Write> Writer<W> {
     /// Writes a record.
     ///
     /// # Errors
-    /// If a sample does not fit the last server, or is earlier than the previous record; then nothing is written. Or if
-    /// the system returns an error.
+    /// If the system returns an error, or if a sample does not match the last server or is earlier than the previous
+    /// record. Such a sample is not written.
     pub fn write(&mut self, record: &Record) -> Result<(), RecordingError> {
         self.progress
             .accept(record)
@@ -87,7 +88,7 @@ impl<W: Write> Writer<W> {
         self.n_bytes
     }
 
-    /// Writes the end, and returns the contents of the recording.
+    /// Writes the end record, and returns the totals of the recording.
     ///
     /// # Errors
     /// If the system returns an error.

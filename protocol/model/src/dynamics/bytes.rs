@@ -1,20 +1,20 @@
 //! Decides most cells with one random byte each.
 //!
-//! Why it is fast: a row of cells takes a few comparisons and blends of bytes, 64 cells at a time.
+//! Why it is fast: a few comparisons and blends of bytes decide 64 cells at a time.
 //!
-//! Why the distribution is the same: let `f(n)` be the most likely vote of a neighbour in state `n` (`n` itself, in the
-//! wildfire). Whatever the neighbours' states, [`super::parents`] draws "tap `t`, and outcome `f(n_t)`" with at least
-//! the probability `p[t] = min_n w[f(n), n, t] / C`. So `floor(256 * p[t])` of the 256 values of a byte stand for this
-//! draw. The other values, the *escapes*, leave the cell to `parents`, which first draws from the residual
-//! distribution. In the wildfire 24 of 256 values escape. `tests/model/dynamics.rs` compares draws with `Phi` for
-//! random models and grids.
+//! Why the distribution is the same: let `f(n)` be the most likely vote of a neighbour in state `n` (in the wildfire
+//! model, `n` itself). Whatever the neighbours' states, [`super::parents`] draws "tap `t`, and outcome `f(n_t)`" with a
+//! probability of at least `p[t] = min_n w[f(n), n, t] / C`. So `floor(256 * p[t])` of the 256 values of a byte stand
+//! for this draw. The other values, the *escapes*, leave the cell to `parents`, which first draws from the residual
+//! distribution. In the wildfire model, 24 of the 256 values escape. `tests/model/dynamics.rs` compares draws with
+//! `Phi` for random models and grids.
 //!
-//! If kernels depend on the cell's own state, byte values stand for different draws in each own state. The neighbour at
-//! the centre tap is the cell itself, with only one possible state, so `f` there is the most likely vote of that state.
-//! A cell that certainly keeps its state is always decided by its byte.
+//! If kernels depend on the cell's own state, so does the meaning of a byte value. The neighbour at the centre tap is
+//! then the cell itself, whose state is known, so `f` at this tap is the most likely vote of that state. If a cell is
+//! certain to keep its state, its byte always decides it.
 //!
 //! If the model has several zones, the bounds of byte values differ between lanes. There is one table for each pattern
-//! of zones that occurs in [`LANES`] cells.
+//! of zones that occurs in a chunk of [`LANES`] cells.
 
 use super::super::grid::Shape;
 use super::lanes::{
@@ -33,25 +33,26 @@ pub(super) struct Bytes {
     /// The index in `fast` of each chunk's table, if the model has several zones. Otherwise all chunks use the first
     /// table.
     of_chunk: Option<Vec<u32>>,
-    /// One bit per home: whether it belongs to a cell of the grid.
+    /// One bit per home, which is set if the home belongs to a cell of the grid.
     on_grid: Vec<u64>,
 }
 
 #[derive(Debug)]
 enum Fast {
-    /// The same for all cells, one table per pattern of zones.
+    /// If kernels do not depend on the own state: one table per pattern of zones.
     Alike {
         tables: Vec<Vec<FastTap>>,
         /// `f` as a table over bytes, or `None` if it maps every state to itself.
         likeliest: Option<Box<[u8; 256]>>,
     },
-    /// For each pattern of zones, one table per own state; and the offset of the cell from its home.
+    /// If kernels depend on the own state: one table per own state for each pattern of zones, and the offset of a cell
+    /// from its home.
     Own(Vec<Vec<FastOwn>>, usize),
 }
 
 impl Bytes {
-    /// Makes the tables for each zone's mixtures: one for all cells, or one per own state. `zones` has the zone of each
-    /// home. Without any mixture, every byte escapes.
+    /// Makes the tables from the mixtures of each zone: one mixture for all cells, or one per own state. `zones`
+    /// contains the zone of each home. Without mixtures, every byte escapes.
     pub(super) fn new(
         mixtures: &[Mixture],
         offsets: &[usize],
@@ -133,8 +134,8 @@ impl Bytes {
         }
     }
 
-    /// Lists the homes of the marked cells in a band and returns their number.
-    #[inline(never)] // Inlined, LLVM runs out of registers, and a step takes 10 % longer.
+    /// Lists the homes of the marked cells in a band, and returns the number of these cells.
+    #[inline(never)] // If it were inlined, LLVM would run out of registers, and a step would take 10 % longer.
     pub(super) fn list_undecided(
         &self,
         places: &Places,
@@ -170,8 +171,8 @@ fn patterns(zones: &[u8]) -> (Vec<[u8; LANES]>, Option<Vec<u32>>) {
     (patterns, Some(of_chunk))
 }
 
-/// Returns the taps that bytes stand for in cells whose own state does not matter. `mixtures` has the mixture of each
-/// lane.
+/// Returns the taps that byte values stand for, if kernels do not depend on the own state. `mixtures` contains the
+/// mixture of each lane.
 fn fast_alike(mixtures: &[&Mixture; LANES], offsets: &[usize], is_zoned: bool) -> Vec<FastTap> {
     let taps = offsets.iter().enumerate();
     let taps = taps.map(|(tap, offset)| (mixtures.map(|it| it.counts()[tap]), *offset));
@@ -182,7 +183,7 @@ fn fast_alike(mixtures: &[&Mixture; LANES], offsets: &[usize], is_zoned: bool) -
     }
 }
 
-/// Returns the meaning of bytes in cells of one own state. `mixtures` has the mixture of each lane.
+/// Returns the meaning of byte values in cells with one own state. `mixtures` contains the mixture of each lane.
 fn fast_own(
     own: usize,
     mixtures: &[&Mixture; LANES],
@@ -213,7 +214,7 @@ fn fast_own(
     }
 }
 
-/// Returns one bit per home: whether it belongs to a cell of the grid.
+/// Returns one bit per home, which is set if the home belongs to a cell of the grid.
 fn on_grid(shape: Shape, stride: usize) -> Vec<u64> {
     let mut bits = vec![0; (shape.height() * stride).div_ceil(LANES)];
     for row in 0..shape.height() {
@@ -224,7 +225,7 @@ fn on_grid(shape: Shape, stride: usize) -> Vec<u64> {
     bits
 }
 
-/// Returns `f` over all bytes, with marks unchanged, or `None` if it maps every state to itself.
+/// Returns `f` as a table over all byte values, which leaves marks unchanged. `None` if `f` maps every state to itself.
 fn table_unless_identity(likeliest: &[usize]) -> Option<Box<[u8; 256]>> {
     let mut table: [u8; 256] = std::array::from_fn(|byte| byte as u8);
     let identity = table;

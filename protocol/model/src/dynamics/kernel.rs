@@ -9,7 +9,7 @@ pub(super) struct Kernel {
     pub(super) n_states: usize,
     pub(super) n_taps: usize,
     /// `w[m, n, t]` as `[tap][from][to]`. The centre tap includes the bias, because its neighbour is the cell itself,
-    /// which always exists. In the kernel of one own state, the centre tap has the weights of that state for every
+    /// which always exists. In a kernel for one own state, the centre tap has the weights of that state for every
     /// `from`.
     pub(super) weights: Vec<f64>,
 }
@@ -55,7 +55,7 @@ impl Kernel {
     }
 }
 
-/// Returns a number in `[0, 1)` from the high 53 bits.
+/// Converts the high 53 bits to a number in `[0, 1)`.
 pub(super) fn uniform(random: u64) -> f64 {
     (random >> 11) as f64 * 2f64.powi(-53)
 }
@@ -68,7 +68,7 @@ pub(super) fn invert(weights: &[f64], uniform: f64) -> u8 {
         sum += weight;
         target < sum
     });
-    // Rounding can leave the target beyond the last sum. Then the last state with a weight is drawn.
+    // Rounding can leave the target beyond the last sum. Then the last state with a positive weight is drawn.
     let last = || weights.iter().rposition(|&weight| weight > 0.0);
     let state = reached
         .or_else(last)

@@ -1,10 +1,11 @@
 //! The vectorised loops of [`super::bytes`], over [`LANES`] cells at once.
 //!
-//! Plain loops over arrays, inlined so that LLVM compiles them for their caller's vectors.
+//! These are plain loops over arrays. They are inlined, so that LLVM compiles them for the same vector instructions as
+//! their caller.
 
 use super::super::randomness::split_mix;
 
-/// Number of cells that are decided by bytes at once, and searched for undecided cells at once.
+/// Number of cells processed at once, both to decide cells by bytes and to find the undecided ones.
 pub(super) const LANES: usize = 64;
 
 /// Mark of a cell that its byte left to the residual distribution. Its high bit distinguishes it from all states, and
@@ -15,8 +16,9 @@ const ESCAPED: u8 = 254;
 #[derive(Debug)]
 pub(super) struct FastTap {
     offset: usize,
-    /// In each lane, the last byte value of this tap; the first one follows the previous tap's. If lanes differ, the
-    /// first value beyond instead, so that a lane can have none.
+    /// In each lane, the last byte value of this tap. Its first value follows the last one of the previous tap. If
+    /// lanes differ, the bound is instead the first value beyond the tap, so that the tap can have no value in some
+    /// lanes.
     bound: [u8; LANES],
 }
 
@@ -26,15 +28,15 @@ pub(super) struct FastOwn {
     pub(super) own: u8,
     /// The most likely vote of the cell itself.
     pub(super) likeliest: u8,
-    /// The bound of the centre tap's byte values, as in [`FastTap`]. `None` if no lane has any.
+    /// The bound of the centre tap's byte values, as in [`FastTap`]. `None` if the tap has no values in any lane.
     pub(super) bound: Option<[u8; LANES]>,
     pub(super) neighbours: Vec<FastTap>,
     /// The pairs `(n, f(n))` of neighbour states whose most likely vote is another state.
     pub(super) changes: Vec<(u8, u8)>,
 }
 
-/// Returns the taps that byte values from `first` on stand for. For each tap, `taps` has the number of values in each
-/// lane and the offset. `DIFFER` is whether lanes differ.
+/// Returns the taps that the byte values from `first` upward stand for. For each tap, `taps` contains the number of
+/// values in each lane and the offset. `DIFFER` is set if these numbers differ between lanes.
 pub(super) fn fast_taps<const DIFFER: bool>(
     first: [usize; LANES],
     taps: impl Iterator<Item = ([usize; LANES], usize)>,
@@ -63,7 +65,8 @@ fn is_within<const DIFFER: bool>(byte: u8, bound: u8) -> bool {
     if DIFFER { byte < bound } else { byte <= bound }
 }
 
-/// Fills `bytes`, which are whole words, with the words `first..` of the SplitMix64 generator of a key.
+/// Fills `bytes` with the outputs of the SplitMix64 generator of a key, starting at output `first`. `bytes` must
+/// consist of whole 64-bit words.
 #[inline(always)]
 pub(super) fn fill(bytes: &mut [u8], key: u64, first: usize) {
     let (words, _) = bytes.as_chunks_mut();
@@ -72,7 +75,7 @@ pub(super) fn fill(bytes: &mut [u8], key: u64, first: usize) {
     }
 }
 
-/// The words of a key's SplitMix64 generator, in sequence.
+/// A reader of the outputs of a key's SplitMix64 generator, in sequence.
 #[derive(Debug)]
 pub(super) struct Words {
     key: u64,
@@ -96,15 +99,16 @@ impl Words {
     }
 }
 
-/// Replaces each byte by the state of the neighbour at the tap that it stands for, or by [`ESCAPED`].
+/// Replaces each byte with the state of the neighbour at the tap that the byte stands for, or with [`ESCAPED`].
 #[inline(always)]
 pub(super) fn blend<const DIFFER: bool>(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     let mut states = [ESCAPED; LANES];
-    // Bounds are cumulative. From the last tap back, each tap overwrites the lanes that a later tap should not have.
+    // Bounds are cumulative. So the loop runs backwards, and each tap overwrites the lanes in which it precedes later
+    // taps.
     for tap in fast.iter().rev() {
         let parent: &[u8; LANES] = parents[tap.offset..]
             .first_chunk()
-            .expect("invariant: a whole chunk of places is under every tap");
+            .expect("invariant: every tap reads a whole chunk of places");
         for lane in 0..LANES {
             // Arithmetic instead of an `if`, because LLVM vectorises it.
             let is_chosen = is_within::<DIFFER>(lanes[lane], tap.bound[lane]);
@@ -115,8 +119,8 @@ pub(super) fn blend<const DIFFER: bool>(lanes: &mut [u8; LANES], fast: &[FastTap
     *lanes = states;
 }
 
-/// Replaces bytes like [`blend`], with the table of the cell's own state. `centre` is the offset of the cell from its
-/// home.
+/// Replaces bytes as [`blend`] does, but with the table of each cell's own state. `centre` is the offset of the cell
+/// from its home.
 #[inline(always)]
 pub(super) fn blend_own<const DIFFER: bool>(
     lanes: &mut [u8; LANES],
@@ -126,7 +130,7 @@ pub(super) fn blend_own<const DIFFER: bool>(
 ) {
     let own: &[u8; LANES] = parents[centre..]
         .first_chunk()
-        .expect("invariant: a whole chunk of places is under every tap");
+        .expect("invariant: every tap reads a whole chunk of places");
     let mut next = [ESCAPED; LANES];
     for table in fast {
         let mut states = *lanes;
@@ -156,8 +160,8 @@ fn replace(lanes: &mut [u8; LANES], by: u8, is_chosen: impl Fn(usize) -> bool) {
     }
 }
 
-/// Returns the high bits of all lanes, with the bit of lane `8 w + b` at position `8 b + w`. This order takes one shift
-/// per word, and no multiplication to gather the bits.
+/// Returns the high bits of all lanes, with the bit of lane `8 w + b` at position `8 b + w`. This order needs only one
+/// shift per word, and no multiplication to gather the bits.
 #[inline]
 pub(super) fn high_bits(lanes: &[u8; LANES]) -> u64 {
     let (words, _) = lanes.as_chunks();
@@ -175,10 +179,10 @@ pub(super) fn transposed(at: u32) -> u32 {
     at % 8 * 8 + at / 8
 }
 
-/// Writes `first` plus the lane of each set bit of [`high_bits`]. May overwrite the rest of `to`.
+/// For each set bit of [`high_bits`], writes `first` plus the bit's lane. May overwrite the rest of `to`.
 ///
-/// Writes eight at a time, needed or not, like simdjson's `flatten_bits`. A loop over the set bits alone would
-/// mispredict its end in most chunks.
+/// Always writes eight entries at a time, even if fewer are needed, as simdjson's `flatten_bits` does. A loop over the
+/// set bits alone would mispredict its end in most chunks.
 #[inline]
 pub(super) fn list_lanes(mut bits: u64, first: u32, to: &mut [u32; LANES]) {
     for eight in to.as_chunks_mut::<8>().0 {

@@ -12,13 +12,13 @@ pub(super) struct Mixture<'k> {
     total: f64,
     /// `f`: the most likely vote of each neighbour state at each tap, as `[tap][from]`.
     likeliest: Vec<Vec<usize>>,
-    /// Number of the 256 byte values that stand for each tap.
+    /// For each tap, the number of byte values (of 256) that stand for it.
     counts: Vec<usize>,
     n_zones: usize,
 }
 
 impl<'k> Mixture<'k> {
-    /// Returns one mixture per kernel. The mixtures of all zones have the same `f`.
+    /// Returns one mixture per kernel. The mixtures of all zones share the same `f`.
     pub(super) fn of_kernels(
         kernels: &'k [Kernel],
         n_zones: usize,
@@ -47,7 +47,7 @@ impl<'k> Mixture<'k> {
             (256.0 * certain.fold(f64::INFINITY, f64::min) / total) as usize
         };
         let mut counts: Vec<usize> = (0..kernel.n_taps).map(count).collect();
-        // If lanes differ, a bound is the first value beyond the tap's, and a byte holds at most 255.
+        // If lanes differ, a bound is the first value beyond the tap. It must fit in a byte, so it is at most 255.
         if n_zones > 1
             && counts.iter().sum::<usize>() > 255
             && let Some(most) = counts.iter_mut().max()
@@ -83,7 +83,7 @@ impl<'k> Mixture<'k> {
         &self.likeliest[tap]
     }
 
-    /// Returns the number of the 256 byte values that stand for each tap.
+    /// Returns, for each tap, the number of byte values (of 256) that stand for it.
     pub(super) fn counts(&self) -> &[usize] {
         &self.counts
     }
@@ -93,8 +93,8 @@ impl<'k> Mixture<'k> {
         self.most[tap] / self.total
     }
 
-    /// Returns where each outcome's part of a tap's interval ends, as `[parent state][outcome]`. The part of the most
-    /// likely outcome is shorter by `taken`, the probability that bytes decide already.
+    /// Returns the end of each outcome's part of a tap's interval, as `[parent state][outcome]`. The part of the most
+    /// likely outcome is shortened by `taken`, the probability of the draws that bytes decide already.
     pub(super) fn ends(&self, tap: usize, taken: f64) -> Vec<Vec<f64>> {
         let of_parent = |(from, &likeliest): (usize, &usize)| {
             let mut end = 0.0;

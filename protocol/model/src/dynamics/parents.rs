@@ -17,31 +17,32 @@ use super::places::{OFF_GRID, Places, centre};
 /// distinguishes it from all states, and its odd value from the mark of an escaped byte.
 const REJECTED: u8 = OFF_GRID;
 
-/// Maximum number of draws of a cell before its kernel is summed. The wildfire rejects about 1 draw in 30, in a corner
-/// 1 in 3. Only models with very unequal column sums often need them all.
+/// Maximum number of draws for a cell before its kernel is summed instead. The wildfire model rejects about 1 draw in
+/// 30, and 1 in 3 in a corner. Only models with very unequal column sums often need all the draws.
 const ROUNDS: usize = 8;
 
 /// Maximum number of rules of [`Parents`]. 64 states with a 3 x 3 kernel stay below it. Larger tables would not stay in
 /// any cache.
 const MAX_RULES: usize = 1 << 16;
 
-/// Tables that draw a tap and its outcome, from the residual distribution of [`super::bytes`] or from the whole.
+/// Tables for drawing a tap and its outcome, either from the residual distribution of [`super::bytes`] or from the
+/// whole distribution.
 ///
-/// Tap `t` has an interval as long as its probability. Each state of its parent divides this interval among the
-/// outcomes. The ends of all these divisions cut it into *rules*: pieces in which each parent state leads to one
-/// outcome. So one draw from an alias table (Walker 1977, Vose 1991) and two look-ups decide a cell. The wildfire has
-/// 53 rules in its residual distribution.
+/// Each tap has an interval whose length is the tap's probability. For each state of the parent, the interval is
+/// divided among the outcomes. The ends of all these parts cut the interval into *rules*: pieces in which each parent
+/// state has exactly one outcome. So one draw from an alias table (Walker 1977, Vose 1991) and two look-ups decide a
+/// cell. The residual distribution of the wildfire model has 53 rules.
 #[derive(Debug)]
 pub(super) struct Parents {
-    /// Two alias tables per mixture: the residual distribution, then the whole. All have the same length, a power of
-    /// two.
+    /// Two alias tables per mixture: for the residual distribution, then for the whole distribution. All tables have
+    /// the same length, a power of two.
     slots: Vec<Slot>,
     log_n_slots: u32,
     /// Rows of outcomes by parent state. The length of a row is a power of two.
     outcomes: Vec<u8>,
     /// The bits of a parent's state that index a row. They map [`OFF_GRID`] to the row's last entry.
     mask: u8,
-    /// The offset of the cell from its home, if its own state chooses the mixture.
+    /// The offset of the cell from its home, if the cell's own state selects the mixture.
     own: Option<usize>,
     /// The first mixture of each home's zone, if the model has several zones.
     first_mixtures: Option<Vec<u16>>,
@@ -59,14 +60,15 @@ struct Rule {
 /// One slot of an alias table.
 #[derive(Debug, Clone, Copy, Default)]
 struct Slot {
-    /// Below this number the first rule is drawn, otherwise the second.
+    /// A random number below this threshold draws the first rule. Any other draws the second.
     threshold: u32,
     rules: [Rule; 2],
 }
 
 impl Parents {
-    /// Makes the tables of each mixture: the part that bytes leave, and the whole. Taps read at `offsets`, and `zones`
-    /// has the zone of each home. Returns `None` if the rules would be too many.
+    /// Makes two tables for each mixture: one for the residual distribution that bytes leave, and one for the whole.
+    /// `offsets` contains the place that each tap reads, and `zones` the zone of each home. Returns `None` if there
+    /// would be too many rules.
     pub(super) fn new(
         mixtures: &[Mixture],
         offsets: &[usize],
@@ -99,8 +101,8 @@ impl Parents {
         })
     }
 
-    /// Draws a parent for every listed cell, and again for rejected ones, up to [`ROUNDS`] times. Returns the number of
-    /// cells that are still rejected; they come first in the list.
+    /// Draws a parent for every listed cell, and again for rejected cells, up to [`ROUNDS`] times. Moves the cells that
+    /// are still rejected to the front of the list, and returns their number.
     #[inline(always)]
     pub(super) fn decide(
         &self,
@@ -136,7 +138,7 @@ impl Parents {
     }
 
     /// Draws once for every listed cell. `mixture` returns the index of a cell's mixture from the states and the cell's
-    /// home. Returns the number of rejected cells; they come first in the list.
+    /// home. Moves rejected cells to the front of the list, and returns their number.
     #[inline(never)] // For the same reason as `Bytes::list_undecided`.
     fn round(
         &self,
@@ -162,8 +164,8 @@ impl Parents {
         n_rejected
     }
 
-    /// Draws an outcome for the cell at `home`. The cell's mark chooses the distribution: the residual one after a
-    /// byte, the whole after a rejection.
+    /// Draws an outcome for the cell at `home`. The cell's mark selects the distribution: the residual one after its
+    /// byte escaped, the whole one after a rejection.
     #[inline]
     fn outcome(&self, mixture: usize, mark: u8, random: u32, states: &[u8], home: u32) -> u8 {
         let table = (mixture << 1 | usize::from(mark & 1)) << self.log_n_slots;
@@ -175,7 +177,8 @@ impl Parents {
     }
 }
 
-/// Returns the rules of a mixture with their lengths, without `taken[t] / 256` of "tap `t`, most likely outcome".
+/// Returns the rules of a mixture with their lengths. Bytes have already decided the draw "tap `t`, most likely
+/// outcome" with probability `taken[t] / 256`, so this much is left out.
 fn rules(
     mixture: &Mixture,
     offsets: &[usize],
@@ -192,7 +195,7 @@ fn rules(
     rules
 }
 
-/// Returns the length of a row, with an outcome for each state and one for a parent off the grid.
+/// Returns the length of a row, which has an outcome for each state and one for a parent off the grid.
 fn row_length(n_states: usize) -> usize {
     (n_states + 1).next_power_of_two()
 }
@@ -257,6 +260,6 @@ fn alias_table(rules: &[(f64, Rule)], n_slots: usize) -> Vec<Slot> {
             small.push(over);
         }
     }
-    // Slots that remain in either list have a share of one, up to rounding. They keep a single rule.
+    // The slots that remain in either list have a share of one, up to rounding, so each keeps a single rule.
     slots
 }

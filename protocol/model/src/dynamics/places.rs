@@ -1,14 +1,14 @@
-//! The buffers of [`super::Dynamics`]: states with a margin around the grid, so that cells at the edge are no special
-//! case.
+//! The buffers of [`super::Dynamics`]: states with a margin around the grid, so that cells at the edge need no special
+//! treatment.
 //!
-//! There is a place for every cell and for a margin of half a kernel. A cell's *home* is the place at the upper left
-//! tap of its kernel; every tap reads at a fixed offset from there.
+//! Every cell has a place, and so has every position in a margin of half a kernel around the grid. A cell's *home* is
+//! the place at the upper left tap of its kernel; every tap reads at a fixed offset from there.
 
 use super::super::grid::Shape;
 use super::super::parameters::Model;
 use super::lanes::LANES;
 
-/// The value of places outside the grid, which add no weight.
+/// The value of places outside the grid that add no weight.
 pub(super) const OFF_GRID: u8 = 255;
 
 #[derive(Debug, Clone)]
@@ -16,9 +16,9 @@ pub(super) struct Places {
     width: usize,
     pub(super) stride: usize,
     margins: [usize; 2],
-    /// `X_k`. The margin holds the model's edge state, or [`OFF_GRID`].
+    /// `X_k`. The margin contains the model's edge state, or [`OFF_GRID`].
     pub(super) states: Vec<u8>,
-    /// By home: first random bytes, then next states and the marks of undecided cells, finally `X_{k+1}`.
+    /// Indexed by home: first random bytes, then next states and the marks of undecided cells, finally `X_{k+1}`.
     pub(super) next: Vec<u8>,
 }
 
@@ -44,7 +44,7 @@ impl Places {
         (n_places, n_homes)
     }
 
-    /// Returns the offset from a cell's home that each tap of a model's kernel reads.
+    /// Returns the offset, from a cell's home, of the place that each tap of a model's kernel reads.
     pub(super) fn offsets(&self, model: &Model) -> Vec<usize> {
         let (_, _, kernel_height, kernel_width) = model.kernel().dim();
         let taps = ndarray::indices((kernel_height, kernel_width)).into_iter();

@@ -1,13 +1,13 @@
-//! Eq. 2, with the beliefs at taps of equal weight added before they are multiplied.
+//! Computes eq. 2. Beliefs at taps with equal weights are added before they are multiplied.
 //!
 //! Why it is fast: taps of one state with equal weights (the eight neighbours in most of the wildfire kernel) are added
-//! once for all next states. A cell takes 35 additions and 16 multiplications instead of the formula's 54 of each.
+//! once for all next states. A cell needs 35 additions and 16 multiplications, where the formula has 54 of each.
 //!
 //! Why the result is the same: `w x + w y = w (x + y)`. `tests/model/models.rs` computes the formula's sums in double
-//! precision, and `transition.rs` there compares them for random models and grids.
+//! precision, and `tests/model/transition.rs` compares the results for random models and grids.
 //!
-//! A weight that differs between zones has a *slot*: one number per lane, according to the zone of the lane's cell.
-//! Most weights are the same in all zones.
+//! A weight that differs between zones has a *slot*: one value per lane, chosen by the zone of the lane's cell. Most
+//! weights are the same in all zones.
 
 use super::super::vectors::LANES;
 use super::layout::Layout;
@@ -62,7 +62,8 @@ impl<T: NdFloat> Own<T> {
         }
     }
 
-    /// Adds the next states of cells that are in this state with probability `p`. `slots` has the lanes' zoned weights.
+    /// Adds the probability of each next state, for cells that are in this own state with probability `p`. `slots`
+    /// contains the zoned weights of the lanes.
     #[inline(always)]
     pub(super) fn add(
         &self,
@@ -129,8 +130,8 @@ impl<T: NdFloat> Row<T> {
     }
 }
 
-/// Returns eq. 2 for cells in state `own`, or for all cells. `kernels` has one kernel per zone, and `columns` the
-/// weights of the groups. Appends weights that differ between zones to `slots`.
+/// Returns the rows of eq. 2 for cells in state `own`, or for all cells. `kernels` contains one kernel per zone, and
+/// `columns` the weights of the groups. Appends weights that differ between zones to `slots`.
 pub(super) fn kernel_rows<T: NdFloat>(
     own: usize,
     kernels: &[&Array4<f64>],
@@ -175,9 +176,9 @@ pub(super) fn kernel_rows<T: NdFloat>(
     (0..n_states).map(&mut row).collect()
 }
 
-/// Groups the taps that have equal columns of weights `w[.., n, a, c]`, over all kernels in turn. Returns the column
-/// and the offsets of each group. Leaves out taps without weight, and the centre tap if kernels depend on the own
-/// state.
+/// Groups the taps whose columns of weights `w[.., n, a, c]` are equal in every kernel. Returns the offsets of each
+/// group, and its columns in all kernels as one vector. Leaves out taps without weight, and the centre tap if kernels
+/// depend on the own state.
 pub(super) fn taps_that_weigh_alike(
     kernels: &[Array4<f64>],
     sees_own_state: bool,
@@ -187,7 +188,8 @@ pub(super) fn taps_that_weigh_alike(
     let is_own = |tap| sees_own_state && tap == (kernel_height / 2, kernel_width / 2);
     let mut groups: Vec<(Vec<f64>, Vec<usize>)> = Vec::new();
     for from in 0..n_states {
-        // With a single kernel, a group stays within one state: another order of additions would change the last bits.
+        // With a single kernel, a group stays within one state, because a different order of additions would change the
+        // last bits.
         let first = if kernels.len() > 1 { 0 } else { groups.len() };
         for (row, col) in (0..kernel_height).flat_map(|a| (0..kernel_width).map(move |c| (a, c))) {
             let columns = kernels

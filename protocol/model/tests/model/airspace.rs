@@ -1,4 +1,4 @@
-//! Where robots may fly and what they see, compared with plain loops over all cells of the grid.
+//! Compares where robots may fly and what they see with plain loops over all cells of the grid.
 
 use super::models::{shape, unit};
 use super::refusals::LAND;
@@ -13,7 +13,7 @@ fn random_map(key: u64, (height, width): (usize, usize)) -> Grid<bool> {
 }
 
 proptest! {
-    // Write no file of failures: tests leave the source tree alone.
+    // Writes no file of failures, because tests must not change the source tree.
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..Default::default() })]
 
     #[test]
@@ -67,7 +67,7 @@ proptest! {
 
 #[test]
 fn random_starts_are_the_largest_connected_part() {
-    // `#`: no-fly cells; `*`: random starts; digits: the size of the part around other cells.
+    // `#` marks no-fly cells and `*` random starts. A digit is the size of the connected part that contains the cell.
     for picture in [
         "33#** 3##** ##1#*",
         "*#2 *#2",
@@ -117,7 +117,7 @@ fn each_ring_has_its_own_observations() {
         assert_eq!((air.radius(), air.n_rings()), (radius, n_rings));
     }
     assert_eq!(Model::wildfire().with_radius(0), Ok(Model::wildfire()));
-    // Maps and sensors without effect make an open airspace.
+    // An airspace is open if its map and sensor have no effect.
     let nowhere = Some(Arc::new(Grid::from_elem((2, 3), false)));
     let air = Airspace::new(shape(2, 3), nowhere, 0, 1, Pays::Seen);
     assert_eq!(air, Airspace::open(shape(2, 3)));

@@ -1,4 +1,4 @@
-//! A step of the world draws from the formula, for any model, and worlds look like the authors'.
+//! Checks that steps are drawn from the formula for any model, and that worlds resemble the authors' worlds.
 
 use super::models::{
     checked, formula, model, random_land, random_model, random_own_model, random_states, shape,
@@ -12,8 +12,8 @@ fn burnout() -> Model {
     Model::built_in("wildfire-burnout").expect("built in")
 }
 
-/// Steps `states` many times and compares each cell's outcomes with their probabilities. By chance, 5 standard
-/// deviations are exceeded with probability < 1e-3, and < 1e-5 for 100 degrees of freedom.
+/// Steps `states` many times and compares each cell's outcomes with their probabilities. The probability of exceeding 5
+/// standard deviations by chance is below 1e-3, and below 1e-5 for 100 degrees of freedom.
 fn check(model: &Model, states: &Grid<u8>, n_draws: u64) {
     let (height, width) = states.dim();
     let mut dynamics = Dynamics::new(model, shape(height, width)).expect("test model");
@@ -35,8 +35,8 @@ fn check(model: &Model, states: &Grid<u8>, n_draws: u64) {
 }
 
 /// Returns the chi-square of counts by cell and outcome, in standard deviations. Outcomes expected fewer than 10 times
-/// share a bin, and impossible ones must not occur. Cells are independent, so statistics and degrees of freedom add up.
-/// With d degrees of freedom, the sum has mean d and variance 2d.
+/// share a bin, and impossible outcomes must not occur. Cells are independent, so statistics and degrees of freedom add
+/// up. With d degrees of freedom, the sum has mean d and variance 2d.
 fn chi_square(counts: &Array3<f64>, expected: &Array3<f64>) -> f64 {
     let (mut sum, mut freedom) = (0.0, 0.0);
     let mut term = |observed: f64, expected: f64| {
@@ -90,7 +90,7 @@ fn random_models_are_drawn_from_the_formula() {
         // A kernel larger than the grid.
         (6, 6, [3, 7], (4, 3), 100_000),
         (8, 2, [1, 1], (2, 3), 100_000),
-        // Too many weights for tables: kernels are summed.
+        // Too many weights for tables, so kernels are summed.
         (14, 64, [5, 5], (2, 2), 20_000),
     ] {
         let states = random_states(key + 1, n_states, side);
@@ -122,7 +122,7 @@ fn lands_are_drawn_from_the_formula() {
         (0, 3, 9, (3, 140), 20_000),
         (1, 3, 9, (3, 140), 20_000),
         (1, 3, 1, (4, 4), 50_000),
-        // Too many weights for tables: kernels are summed.
+        // Too many weights for tables, so kernels are summed.
         (1, 16, 5, (2, 3), 20_000),
     ] {
         let of_zone = |zone: u64| random[sees_own](7 + 1000 * zone, n_states, [3, 3]);
@@ -130,7 +130,7 @@ fn lands_are_drawn_from_the_formula() {
         let states = random_states(8, n_states, side);
         check(&random_land(7, &models, side), &states, n_draws);
     }
-    // In a river no cell burns, so bytes are certain.
+    // No cell of a river burns, so its bytes always decide.
     let mut river = burnout().file().clone();
     let entry = |state: &String| KernelEntry {
         zone: None,
@@ -150,7 +150,8 @@ fn lands_are_drawn_from_the_formula() {
 
 #[test]
 fn cells_that_reject_almost_every_parent_are_drawn_from_the_formula() {
-    // State 0 has 1e-4 of the weight of state 1: a cell among zeros accepts a parent once in 10,000 draws.
+    // The weight of state 0 is 1e-4 of the weight of state 1, so a cell among neighbours in state 0 accepts a parent
+    // once in 10,000 draws.
     let weight = |to, from, row, col| {
         let scale = if from == 0 { 1e-4 } else { 1.0 };
         scale * (1 + to + row * col) as f64
@@ -166,7 +167,7 @@ fn deterministic_models_move_as_they_must() {
         let weight = |to, from, row, _| f64::from(row == 0 && to == from);
         model(3, [3, 1], weight, |to| if to == 2 { bias } else { 0.0 })
     };
-    // The neighbours beyond the edge are missing, and they have all the weight.
+    // All the weight is on neighbours beyond the edge, which do not exist.
     let error = Dynamics::new(&shift_down(0.0), shape(3, 2)).expect_err("no weight in row 0");
     assert!(error.to_string().contains("(0, 0)"), "{error}");
     for model in [with_edge(&shift_down(0.0), 2), shift_down(1e-20)] {
@@ -190,12 +191,12 @@ fn hash_after(model: &Model, shape: Shape, n_steps: u64) -> u64 {
 
 #[test]
 fn a_trajectory_is_the_same_on_every_platform() {
-    // Pinned at version 0.1.0: if one changes, so do the worlds of every published seed.
+    // These hashes were recorded at version 0.1.0. If one changes, the worlds of every published seed change too.
     let grid = shape(64, 64);
     let wildfire = hash_after(&Model::wildfire(), grid, 1000);
     assert_eq!(wildfire, 0x5b72_805c_3e44_c4a8);
     assert_eq!(hash_after(&burnout(), grid, 1000), 0xd2cf_307c_c03b_0b99);
-    // Escapes, redraws and summed kernels all occur in these.
+    // Escapes, redraws and summed kernels all occur in these worlds.
     let random = hash_after(&random_model(4, 4, [5, 5]), shape(7, 5), 10_000);
     assert_eq!(random, 0x4974_9562_5f3d_1a6d);
     let own = hash_after(&random_own_model(4, 4, [5, 5]), shape(7, 5), 10_000);
@@ -226,7 +227,8 @@ fn worlds_look_like_the_authors() {
             ours[name]
         );
     }
-    // Wide error bars alone do not explain the agreement: the drift is 20 standard errors from zero in the example.
+    // Wide error bars are not the only reason for the agreement: in the example, the drift is 20 standard errors from
+    // zero.
     let drift = ours["new_fire_above_minus_below"];
     assert!(drift.mean > 5.0 * drift.se, "{drift:?}");
 }

@@ -1,4 +1,4 @@
-//! Models other than the wildfire, random states and beliefs, and the formula that all models follow.
+//! Models other than the wildfire model, random states and beliefs, and the formula that all models follow.
 
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{CellMap, Grid, KernelEntry, Model, ModelFile, Shape, ZoneEntry};
@@ -84,7 +84,7 @@ pub fn random_own_model(key: u64, n_states: usize, kernel_size: [usize; 2]) -> M
     checked(file)
 }
 
-/// Makes a land: zones scattered over a grid, each with the kernels of another model.
+/// Makes a model with zones scattered over a grid. Each zone has the kernels of another model.
 pub fn zoned(models: &[Model], key: u64, (height, width): (usize, usize)) -> Model {
     let mut file = models[0].file().clone();
     let (name, n_zones) = (|zone: usize| format!("z{zone}"), models.len());
@@ -108,7 +108,7 @@ pub fn zoned(models: &[Model], key: u64, (height, width): (usize, usize)) -> Mod
     checked(file)
 }
 
-/// Makes a land of random models, with some weights that are the same in all zones.
+/// Makes a zoned model from random models. Some weights are the same in all zones.
 pub fn random_land(key: u64, models: &[Model], side: (usize, usize)) -> Model {
     let mut file = zoned(models, key, side).file().clone();
     let n_entries = models[0].file().kernel.len();
@@ -119,7 +119,7 @@ pub fn random_land(key: u64, models: &[Model], side: (usize, usize)) -> Model {
 }
 
 /// Computes each state's probability in each cell after a step (paper eqs. 2 to 4), directly from the entries of the
-/// model's file, as docs/model-file.md explains them.
+/// model file, as explained in docs/model-file.md.
 pub fn formula(model: &Model, p: &Array3<f64>) -> Array3<f64> {
     let file = model.file();
     let (n_states, height, width) = p.dim();
@@ -179,7 +179,7 @@ pub fn random_states(key: u64, n_states: usize, (height, width): (usize, usize))
     })
 }
 
-/// Makes a random belief, in which each cell sums to one.
+/// Makes a random belief. The probabilities of each cell sum to one.
 pub fn random_belief(key: u64, n_states: usize, (height, width): (usize, usize)) -> Array3<f64> {
     let mut belief = Array3::from_shape_fn((n_states, height, width), |(state, row, col)| {
         unit(key, (state * height + row) * width + col)

@@ -1,4 +1,4 @@
-//! Invalid entries of a model file are refused by name; valid ones are kept as they were written.
+//! Checks that an error names the invalid entry of a model file, and that valid entries are kept as they were written.
 
 use super::models::{checked, shape};
 use emberwatch_model::{KernelEntry, Model, ModelError, StateEntry, ZoneEntry};

@@ -1,8 +1,8 @@
-//! Statistics of wildfire worlds, named as in `tests/data/b_world_stats.json`, with mean and standard error over
-//! independent runs.
+//! Statistics of wildfire worlds: mean and standard error over independent runs. Names are as in
+//! `tests/data/b_world_stats.json`.
 //!
-//! Definitions, with `X` the states at a step and `X'` one step later. All are averages over steps 15,000 to 35,000 of
-//! one 64 x 64 run; ratios are ratios of counts over the whole run.
+//! In these definitions, `X` are the states at a step, and `X'` the states one step later. All statistics are averages
+//! over steps 15,000 to 35,000 of one 64 x 64 run. Ratios are ratios of counts over the whole run.
 //! - `mean_fraction_s`, `within_run_sd_fraction_s`: fraction of cells in state s, mean and standard
 //!   deviation over time
 //! - `transitions_per_step_atob`, `cond_prob_atob`, `changes_per_step`: cells with `X = a`, `X' = b`
@@ -17,7 +17,7 @@ const SIDE: usize = 64;
 const FIRST_STEP: u64 = 15_000;
 const LAST_STEP: u64 = 35_000;
 
-/// Only every tenth step is counted: states are correlated over thousands of steps.
+/// Only every tenth step is counted, because states are correlated over thousands of steps.
 const EVERY: u64 = 10;
 
 const LATENT: usize = 1;
@@ -40,7 +40,7 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Returns the difference to another estimate in combined standard errors.
+    /// Returns the difference from another estimate, in combined standard errors.
     pub fn deviation(self, other: Self) -> f64 {
         (self.mean - other.mean) / self.se.hypot(other.se)
     }
@@ -157,8 +157,8 @@ impl Counts {
 
     fn insert_neighbours(&self, all: &mut Statistics) {
         for (seen, (name, ..)) in self.neighbours.iter().zip(DIRECTIONS) {
-            // The share of cells, selected by their states before and after the step, whose neighbour is in a given
-            // state.
+            // Cells are selected by their states before and after the step. This is the share of them whose neighbour
+            // is in a given state.
             let share = |neighbour: usize, is_counted: &dyn Fn(usize, usize) -> bool| {
                 let mut counts = [0.0; 3];
                 for (neighbour, from, to) in ndarray::indices((3, 3, 3)) {

@@ -1,4 +1,4 @@
-//! `Phi` on beliefs, compared with its formula for random models and grids.
+//! Compares `Phi` on beliefs with its formula for random models and grids.
 
 use super::models::{
     formula, random_belief, random_land, random_model, random_own_model, shape, with_edge,
@@ -7,7 +7,7 @@ use emberwatch_model::{Model, Transition};
 use ndarray::{Array3, Axis, NdFloat};
 use proptest::prelude::*;
 
-/// Returns `Phi` of a belief, by an operator that was applied to another belief before.
+/// Returns `Phi` of a belief, computed by an operator that was applied to another belief before.
 fn predicted<T: NdFloat>(model: &Model, belief: &Array3<T>) -> Array3<T> {
     let (_, height, width) = belief.dim();
     let mut out = Array3::ones(belief.dim());
@@ -25,7 +25,7 @@ fn assert_close(got: &Array3<f64>, expected: &Array3<f64>, bound: f64) {
 }
 
 proptest! {
-    // Write no file of failures: tests leave the source tree alone.
+    // Writes no file of failures, because tests must not change the source tree.
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..Default::default() })]
 
     #[test]

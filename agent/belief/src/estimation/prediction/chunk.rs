@@ -14,7 +14,7 @@ const NODES: [(f32, f32); 2] = [(0.585_786_46, 0.853_553_4), (3.414_213_7, 0.146
 /// A single node at 0, where the quadrature is the mean field. Exact if the total `D` is certain.
 const MEAN_FIELD: [(f32, f32); 1] = [(0.0, 1.0)];
 
-/// A total of weights up to this value counts as 0 with rounding errors.
+/// Totals of weights up to this value are treated as zeros with rounding errors.
 const MIN_TOTAL: f32 = 1e-30;
 
 /// Work space and results of the prediction of one chunk of cells.
@@ -22,12 +22,12 @@ const MIN_TOTAL: f32 = 1e-30;
 pub struct ChunkPredictor {
     /// For each kernel, the probability of each of its next states.
     pub distributions: Vec<Vec<Lanes>>,
-    /// For each neighbour, the same probabilities given that this neighbour is susceptible. They belong to the kernel
-    /// of the susceptible state.
+    /// For each neighbour, the probabilities of the susceptible state's kernel, given that this neighbour is
+    /// susceptible.
     pub cavity_distributions: Vec<Vec<Lanes>>,
-    /// For each source, the sum over its group of the belief in its state.
+    /// For each source, the belief that a neighbour is in its state, summed over the group's neighbours.
     belief_sums: Vec<Lanes>,
-    /// For each source, the sum over its group of the belief in its state divided by `f_k`.
+    /// For each source, the same belief divided by `f_k`, summed over the group's neighbours.
     ratio_sums: Vec<Lanes>,
     /// The weight of each next state.
     weights: Vec<Lanes>,
@@ -42,7 +42,7 @@ pub struct ChunkPredictor {
 /// Input of the prediction of one chunk.
 #[derive(Clone, Copy)]
 pub struct ChunkInputs<'a> {
-    /// The number in each slot of the layout.
+    /// The value in each slot of the layout.
     pub slots: &'a [Lanes],
     /// The planes of all beliefs.
     pub planes: &'a [f32],
@@ -82,7 +82,8 @@ impl ChunkPredictor {
         }
     }
 
-    /// Computes the next-state distribution of a kernel, and if `has_cavities` its cavity distributions.
+    /// Computes the next-state distribution of a kernel. If `has_cavities` is set, also computes its cavity
+    /// distributions.
     #[inline(always)] // So that `vectorised` compiles it for this processor's vector instructions.
     pub fn predict(
         &mut self,
@@ -150,8 +151,8 @@ impl ChunkPredictor {
         mean
     }
 
-    /// Computes `b[m] + sum_k g_k[m] / f_k`, the weights of one node. Without `at_node`, it is computed for `t = 0`,
-    /// where it is the mean of eq. 2.
+    /// Computes `b[m] + sum_k g_k[m] / f_k`, the weights at one node. If `at_node` is not set, computes the weights at
+    /// `t = 0`, where they equal the mean of eq. 2.
     #[inline(always)]
     fn sum_weights(&mut self, kernel: &OwnKernel, slots: &[Lanes], at_node: bool) {
         for (weight, slot) in self.weights.iter_mut().zip(&kernel.bias_slots) {
@@ -239,8 +240,8 @@ impl ChunkPredictor {
 
     /// Adds the term of one node to the cavity distributions of a group's neighbours.
     ///
-    /// The susceptible neighbour `k` contributes its weights in that state instead of `g_k[m]`, and its `exp(-t d)`
-    /// instead of `f_k`. `factor` contains the product of all `f_k`.
+    /// Each cavity assumes that its neighbour `k` is susceptible. The weights in that state then replace `g_k[m]`, and
+    /// `exp(-t d)` replaces `f_k`. `factor` contains the product of all `f_k`.
     #[inline(always)]
     fn add_cavities(
         &mut self,
@@ -313,11 +314,11 @@ fn multiply_few<const N: usize>(
     products.ratio_sums.copy_from_slice(&ratio_sums);
 }
 
-/// Computes `f_k` for each neighbour of a group, and sums the neighbours' beliefs divided by it.
+/// Computes `f_k` for each neighbour of a group, and sums the neighbours' beliefs divided by `f_k`.
 ///
 /// `f_k = 1 - sum_n p_k[n] (1 - exp(-t d[n]))`, where `p_k[n]` is the belief that the neighbour is in state `n`. So
-/// `f_k` is 1 for a neighbour outside the grid, whose beliefs are all 0. `complements` has `1 - exp(-t d)` for each
-/// source.
+/// `f_k` is 1 for a neighbour outside the grid, whose beliefs are all 0. `complements` contains `1 - exp(-t d)` for
+/// each source.
 #[inline(always)]
 fn multiply_factors(
     sources: &[Source],

@@ -1,4 +1,5 @@
-//! Transition weights, and the kernels that a prediction reads: positive weights only, grouped by neighbours.
+//! Transition weights, and the kernels that a prediction reads. These contain only positive weights, and group the
+//! neighbours that have equal weights.
 
 use emberwatch_model::{Grid, Model};
 use ndarray::Array4;
@@ -12,7 +13,7 @@ pub struct Weights<'a> {
     pub bias: &'a [f64],
     /// The zone of each cell, shape `[H, W]`, and the number of zones.
     pub zones: (Option<&'a Grid<u8>>, usize),
-    /// The state of all cells outside the grid. With `None`, they add no weight.
+    /// The state of all cells outside the grid. If `None`, these cells add no weight.
     pub edge: Option<usize>,
 }
 
@@ -27,12 +28,12 @@ impl<'a> From<&'a Model> for Weights<'a> {
     }
 }
 
-/// The weights of one own state that depend on the neighbours' states.
+/// The weights of one own state (the cell's current state) that depend on the neighbours' states.
 ///
-/// Weights are stored in *slots*, because zones can differ in them: see `Layout::slots`.
+/// Weights are stored in *slots* (`Layout::slots`), because they can differ between zones.
 #[derive(Debug, Clone)]
 pub struct OwnKernel {
-    /// The own state. `None`: the kernel applies to all own states.
+    /// The own state. If `None`, the kernel applies to all own states.
     pub own_state: Option<usize>,
     /// The possible next states.
     pub next_states: Vec<usize>,
@@ -43,7 +44,7 @@ pub struct OwnKernel {
     pub total_slots: Vec<usize>,
     /// Whether the total `d` of some neighbour depends on its state.
     pub totals_differ: bool,
-    /// Sum over neighbours of how much their state can change each weight, as a share of the mean total `D`.
+    /// How much the states of all neighbours together can change the weights, as a fraction of the mean total `D`.
     pub influence: f64,
 }
 
@@ -55,7 +56,7 @@ pub struct Group {
     pub sources: Vec<Source>,
 }
 
-/// A state of a group's neighbours with a positive weight.
+/// A state in which the neighbours of a group have a positive weight.
 #[derive(Debug, Clone)]
 pub struct Source {
     pub state: usize,

@@ -1,14 +1,14 @@
 //! Arithmetic on [`LANES`] cells at once, one per lane of a vector.
 //!
-//! Loops are written out, because closures of iterators are not always compiled for the vectors of the processor. Every
-//! lane does the same operations in the same order and none is fused, so results are bit-identical on every platform.
+//! Loops are written out, because iterator closures are not always compiled to vector instructions. Every lane runs the
+//! same operations in the same order, without fused multiply-adds, so results are bit-identical on every platform.
 
 pub use emberwatch_model::vectors::LANES;
 
-/// One number for each cell of a chunk.
+/// One value for each cell of a chunk.
 pub type Lanes = [f32; LANES];
 
-/// Returns the [`LANES`] numbers that start at an index.
+/// Returns the [`LANES`] values that start at an index.
 #[inline(always)]
 pub fn lanes_from(numbers: &[f32], at: usize) -> &Lanes {
     let lanes = numbers[at..].first_chunk();
@@ -49,7 +49,7 @@ pub fn divided(a: f32, by: &Lanes) -> Lanes {
     to
 }
 
-/// Returns the sum of several numbers for each lane.
+/// Returns the sum of several values for each lane.
 #[inline(always)]
 pub fn sum(all: &[Lanes]) -> Lanes {
     let mut sum = [0.0; LANES];
@@ -65,7 +65,7 @@ pub fn sum(all: &[Lanes]) -> Lanes {
 /// polynomial of degree 6.
 #[inline(always)]
 pub fn exponential(a: &Lanes, b: &Lanes) -> Lanes {
-    // 1.5 * 2^23: adding it rounds to an integer, which the lowest bits of the sum hold.
+    // Adding 1.5 * 2^23 rounds a number to an integer, which the lowest bits of the sum contain.
     const ROUNDING: f32 = 12_582_912.0;
     let mut to = [0.0; LANES];
     for lane in 0..LANES {

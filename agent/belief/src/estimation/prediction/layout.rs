@@ -4,7 +4,8 @@ use super::kernels::{FixedTransition, Group, OwnKernel, Source, Weights};
 use emberwatch_model::zoned::ZonedNumbers;
 use ndarray::Array4;
 
-/// Totals of scaled weights that differ by less count as equal. The tolerance exceeds rounding errors of the summation.
+/// Maximum difference between totals of scaled weights that count as equal. It exceeds the rounding errors of the
+/// summation.
 const TOTAL_TOLERANCE: f64 = 1e-9;
 
 /// All weights of a model, arranged for predictions.
@@ -12,9 +13,9 @@ const TOTAL_TOLERANCE: f64 = 1e-9;
 pub struct Layout {
     pub kernels: Vec<OwnKernel>,
     pub fixed: Vec<FixedTransition>,
-    /// Row and column of each neighbour in the kernel. Own-state kernels have no tap at the centre.
+    /// Row and column of each neighbour in the kernel. With own-state kernels, the centre is not a tap.
     pub taps: Vec<[usize; 2]>,
-    /// The number in each slot, by the zone of the cell.
+    /// The value in each slot, by the zone of the cell.
     pub slots: ZonedNumbers<f32>,
 }
 
@@ -47,7 +48,7 @@ impl Layout {
     }
 }
 
-/// Collects slots while kernels are built. Numbers that depend on the zone are listed with one entry per zone.
+/// A builder of kernels, which collects their slots. Values that depend on the zone are lists with one entry per zone.
 struct Builder<'a> {
     weights: Weights<'a>,
     n_states: usize,
@@ -56,10 +57,10 @@ struct Builder<'a> {
     /// Row and column of each neighbour in the kernel.
     taps: Vec<[usize; 2]>,
     centre: [usize; 2],
-    /// For each own state, the power of two that scales its largest weight to at least 1 and below 2, so that all
+    /// For each own state, the power of two that scales its largest weight to at least 1 and less than 2, so that all
     /// weights fit in `f32`.
     scales: Vec<f64>,
-    /// The number in each slot, by zone.
+    /// The value in each slot, by zone.
     slots: Vec<Vec<f32>>,
 }
 
@@ -88,7 +89,7 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// Builds the kernel of an own state. A kernel for all own states has the number 0.
+    /// Builds the kernel of an own state. A kernel that applies to all own states has index 0.
     fn own_kernel(&mut self, own: usize) -> OwnKernel {
         let next_states = self.next_states(own);
         let biases: Vec<_> = next_states.iter().map(|m| self.bias(own, *m)).collect();
@@ -113,7 +114,7 @@ impl<'a> Builder<'a> {
         kernel
     }
 
-    /// Builds the transition of an own state without neighbours that have a weight.
+    /// Builds the transition of an own state that no neighbour influences.
     fn fixed_transition(&mut self, own_state: usize) -> FixedTransition {
         let biases: Vec<_> = (0..self.n_states)
             .map(|m| self.bias(own_state, m))
@@ -142,7 +143,7 @@ impl<'a> Builder<'a> {
         self.zones(own).map(|kernel| scale * f(kernel)).collect()
     }
 
-    /// Returns the slot with the given numbers. Adds a slot if there is none.
+    /// Returns the slot with the given values. Adds a slot if there is none.
     fn slot(&mut self, by_zone: &[f64]) -> usize {
         let by_zone: Vec<f32> = by_zone.iter().map(|number| *number as f32).collect();
         let known = self.slots.iter().position(|known| *known == by_zone);
@@ -152,7 +153,7 @@ impl<'a> Builder<'a> {
         })
     }
 
-    /// Returns the weight of a next state for a neighbour's state, by zone.
+    /// Returns the weight that a neighbour's state adds to a next state, by zone.
     fn weight(&self, own: usize, next: usize, state: usize, [row, col]: [usize; 2]) -> Vec<f64> {
         self.by_zone(own, |kernel| kernel[[next, state, row, col]])
     }
@@ -161,7 +162,7 @@ impl<'a> Builder<'a> {
         self.weight(own, next, state, tap).iter().any(|w| *w > 0.0)
     }
 
-    /// Returns the weight of a next state without neighbours, by zone.
+    /// Returns the weight that a next state has without any neighbours, by zone.
     fn bias(&self, own: usize, next: usize) -> Vec<f64> {
         let [row, col] = self.centre;
         let bias = self.weights.bias[next];

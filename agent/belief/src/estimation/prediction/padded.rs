@@ -1,4 +1,4 @@
-//! The belief and the cavities of a prediction, in planes with margins.
+//! Storage for the belief and the cavities of a prediction, in planes with margins.
 
 use super::lanes::{LANES, Lanes, add_product, lanes_from};
 use super::planes::Planes;
@@ -11,8 +11,8 @@ const MAX_FACTOR: f32 = 1e30;
 
 /// Beliefs about one grid: a cavity per neighbour, if there are cavities, then the belief itself.
 ///
-/// Each has one plane per state. The margins hold the belief about cells outside the grid: certainty of the edge state,
-/// or zeros.
+/// Each belief has one plane per state. The margins contain the belief about cells outside the grid: probability 1 for
+/// the edge state, or zeros if there is none.
 #[derive(Debug, Clone)]
 pub struct PaddedBeliefs {
     shape: Shape,
@@ -23,9 +23,9 @@ pub struct PaddedBeliefs {
 }
 
 impl PaddedBeliefs {
-    /// Copies a belief into each cavity and into the belief itself.
+    /// Creates planes for a belief. Each cavity starts as a copy of the belief.
     ///
-    /// `kernel` has the number of rows and columns of the transition kernel, which set the margins.
+    /// `kernel` is the number of rows and columns of the transition kernel, which determine the margins.
     pub fn new(
         belief: &Belief,
         kernel: [usize; 2],
@@ -50,7 +50,7 @@ impl PaddedBeliefs {
         }
     }
 
-    /// Returns the start of a cavity's first plane. The number `n_cavities` stands for the belief itself.
+    /// Returns the start of a cavity's first plane. The index `n_cavities` stands for the belief itself.
     #[inline(always)]
     pub fn start(&self, cavity: usize) -> usize {
         cavity * self.n_states * self.planes.length
@@ -76,7 +76,7 @@ impl PaddedBeliefs {
     }
 
     /// Loads the cavities from bytes. Returns false and changes nothing if the length differs, or if
-    /// [`Belief::from_bytes`] refuses a cavity.
+    /// [`Belief::from_bytes`] rejects a cavity.
     pub fn restore_cavities(&mut self, bytes: &[u8]) -> bool {
         if bytes.len() != self.n_bytes() {
             return false;
@@ -97,7 +97,7 @@ impl PaddedBeliefs {
     }
 
     /// Multiplies each cell's cavities by the factors that turn the belief `before` into `after`, both `[S, H, W]`, and
-    /// normalises them.
+    /// normalises the products.
     pub fn correct_cavities(&mut self, before: &[f32], after: &[f32]) {
         let mut factors = vec![[1.0; LANES]; self.n_states];
         vectorised(
@@ -112,7 +112,7 @@ impl PaddedBeliefs {
         );
     }
 
-    /// Corrects the cavities of the chunk of cells that starts at a cell.
+    /// Corrects the cavities of the chunk of cells that starts at `[row, col]`.
     #[inline(always)]
     fn correct_chunk(
         &mut self,
@@ -149,7 +149,8 @@ impl PaddedBeliefs {
     }
 }
 
-/// Computes the factor from `before` to `after` of each state and cell of a chunk. States are `n_cells` numbers apart.
+/// Computes the factors that turn `before` into `after`, for each state and cell of a chunk. States are `n_cells`
+/// values apart.
 ///
 /// Returns whether each cell's belief has changed.
 #[inline(always)]

@@ -1,4 +1,4 @@
-//! Planes with margins around a grid, so that every neighbour of a cell can be read.
+//! Planes with margins around a grid, so that cells at the edge have all their neighbours too.
 
 use super::lanes::LANES;
 use emberwatch_model::Shape;
@@ -7,7 +7,7 @@ use emberwatch_model::Shape;
 #[derive(Debug, Clone, Copy)]
 pub struct Planes {
     shape: Shape,
-    /// Rows above and below the grid, columns to the left and right of it.
+    /// Number of rows above and below the grid, and of columns to its left and right.
     margin: [usize; 2],
     stride: usize,
     /// Number of cells of a plane, with margins.
@@ -15,7 +15,7 @@ pub struct Planes {
 }
 
 impl Planes {
-    /// Lays out planes with margins of half a kernel.
+    /// Lays out planes whose margins are half as wide as the kernel.
     pub fn new(shape: Shape, kernel: [usize; 2]) -> Self {
         let margin = kernel.map(|side| side / 2);
         let stride = shape.width().next_multiple_of(LANES) + 2 * margin[1];
@@ -48,7 +48,7 @@ impl Planes {
         }
     }
 
-    /// Returns the grid's rows of a plane, without margins.
+    /// Returns the rows of a plane without the margins.
     pub fn rows<'a>(&self, plane: &'a [f32]) -> impl Iterator<Item = &'a [f32]> + use<'a> {
         let Self { shape, .. } = *self;
         let rows = plane[self.place([0, 0])..].chunks(self.stride);

@@ -78,7 +78,7 @@ fn framed(inner: &Belief) -> Belief {
 }
 
 #[test]
-fn an_edge_is_a_frame_of_cells_in_its_state() {
+fn an_edge_state_equals_a_border_of_cells_in_that_state() {
     let kernels = fire();
     let weights = weights(&kernels, &[0.0; 3]);
     let with_edge = Weights {
@@ -104,7 +104,7 @@ fn an_edge_is_a_frame_of_cells_in_its_state() {
 }
 
 #[test]
-fn weights_of_any_size_predict_alike() {
+fn the_scale_of_weights_does_not_change_predictions() {
     let kernels = fire();
     for exponent in [-300, 300] {
         let scale = 2.0_f64.powi(exponent);
@@ -131,8 +131,8 @@ fn weights<'a>(kernels: &'a [Array4<f64>], bias: &'a [f64]) -> Weights<'a> {
     }
 }
 
-/// Returns the kernels of a fire. A cell with `f` burning neighbours of four ignites with probability `f / (a f + b)`,
-/// and a burning cell burns out with probability 0.1.
+/// Returns the kernels of a fire. A cell ignites with probability `f / (a f + b)` if `f` of its four neighbours burn. A
+/// burning cell burns out with probability 0.1.
 fn fire() -> Vec<Array4<f64>> {
     let (a, b) = (0.7, 1.8);
     let mut kernels = vec![Array4::zeros((3, 3, 3, 3)); 3];
@@ -169,7 +169,7 @@ fn paper() -> Vec<Array4<f64>> {
 
 #[test]
 fn each_kind_is_closer_to_the_exact_filter_than_the_one_before() {
-    // Bounds are a tenth above the measured values. Without own-state kernels there are no cavities.
+    // Bounds are 10% above the measured values. Without own-state kernels there are no cavities.
     for (kernels, bias, dim, one_in, n_worlds, bounds) in [
         (fire(), [0.0; 3], (2, 3), 0, 1, [0.134, 0.098, 0.076]),
         (fire(), [0.0; 3], (2, 3), 5, 40, [0.170, 0.128, 0.082]),
@@ -193,7 +193,7 @@ fn each_kind_is_closer_to_the_exact_filter_than_the_one_before() {
 const BIAS: [f64; 3] = [0.01, 0.001, 0.001];
 
 #[test]
-fn cavities_stay_distributions_where_several_own_states_act() {
+fn cavities_sum_to_one_with_several_own_state_kernels() {
     // Own-state kernels like learned kernels: neighbours influence every own state, and state 1 the most.
     let kernel = |own: usize| {
         Array4::from_shape_fn((3, 3, 3, 3), |(m, n, row, col)| {
@@ -222,7 +222,7 @@ fn cavities_stay_distributions_where_several_own_states_act() {
 }
 
 #[test]
-fn a_correction_changes_the_cavities_of_its_cells_alone() {
+fn a_correction_changes_only_the_cavities_of_its_cells() {
     let kernels = fire();
     let states = Grid::from_shape_vec((1, 5), vec![1, 0, 0, 0, 0]).expect("a grid");
     let mut belief = Belief::from_states(&states, 3).expect("states");
@@ -243,7 +243,7 @@ fn a_correction_changes_the_cavities_of_its_cells_alone() {
 }
 
 #[test]
-fn unseen_cells_stay_distributions_for_ever() {
+fn beliefs_about_unseen_cells_keep_summing_to_one() {
     // The rounded probabilities of this model's fixed transitions do not sum to 1.
     let model = Model::built_in("wildfire-burnout").expect("built in");
     let mut belief = belief(model.n_states(), shape(3, 5));
@@ -257,7 +257,7 @@ fn unseen_cells_stay_distributions_for_ever() {
 }
 
 #[test]
-fn only_bytes_of_cavities_are_restored() {
+fn only_valid_cavities_are_restored() {
     let kernels = fire();
     let weights = Weights {
         edge: Some(2),
@@ -278,12 +278,12 @@ fn only_bytes_of_cavities_are_restored() {
     let last = bytes.len() / 4 - 1;
     for (name, refused) in [
         ("nothing", Vec::new()),
-        ("a number too few", bytes[4..].to_vec()),
+        ("a value too few", bytes[4..].to_vec()),
         ("a byte too many", [&bytes[..], &[0]].concat()),
         ("zeros", vec![0; bytes.len()]),
-        ("a sum over one", with(0, 1.0005)),
+        ("a sum above 1", with(0, 1.0005)),
         ("a negative number", with(last, -0.5)),
-        ("no number", with(last, f32::NAN)),
+        ("not a number", with(last, f32::NAN)),
     ] {
         assert!(!second.restore(&refused), "{name}");
         assert_eq!(second.beliefs.probabilities, unchanged, "{name}");

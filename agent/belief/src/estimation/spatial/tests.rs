@@ -5,7 +5,7 @@
 //! np.savez(name, table=table, cells=cells, obs=obs, first_predictor=u_1, post=posteriors[2::3])  # 32 bits
 //! ```
 //!
-//! Cells are listed in order of first visit, and padded with -1 where a path visits fewer.
+//! Cells are listed in order of first visit, and padded with -1 if a path visits fewer cells.
 
 use super::*;
 use crate::estimation::correlations::N_AGES;
@@ -30,7 +30,7 @@ fn shape(height: usize, width: usize) -> Shape {
 }
 
 #[test]
-fn corrections_are_those_of_an_independent_implementation() {
+fn corrections_agree_with_an_independent_implementation() {
     for side in [16, 64] {
         let root = env!("CARGO_MANIFEST_DIR");
         let path = format!("{root}/tests/data/spatial_{side}.npz");
@@ -60,7 +60,7 @@ fn corrections_are_those_of_an_independent_implementation() {
 }
 
 #[test]
-fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
+fn an_impossible_frame_changes_nothing_with_or_without_spread() {
     let model = wildfire(|file| file.states[0].observed_as = vec![1.0, 0.0, 0.0]);
     let states = ndarray::arr2(&[[2, 2], [0, 2]]);
     let prior = Belief::from_states(&states, 3).expect("states");
@@ -79,7 +79,7 @@ fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
 }
 
 #[test]
-fn a_tiny_probability_is_evidence_with_neighbours_too() {
+fn a_tiny_probability_does_not_count_as_zero() {
     let model = wildfire(|file| file.states[FIRE].observed_as = vec![0.0, 0.02, 0.98]);
     let prior = ndarray::arr3(&[[[1e-9]], [[0.0]], [[1.0]]]);
     let prior = Belief::from_probabilities(prior).expect("a belief");
@@ -90,7 +90,7 @@ fn a_tiny_probability_is_evidence_with_neighbours_too() {
     assert_eq!(filter.belief().as_slice(), [1.0, 0.0, 0.0]);
 }
 
-/// Returns a model of three or four states, in which any state can be the paying one.
+/// Returns a model of three or four states in which only one state, chosen by `paying`, has a reward.
 fn model(paying: usize) -> Model {
     let (name, paying) = match paying.checked_sub(3) {
         Some(paying) => ("road-ice", paying),
@@ -107,7 +107,7 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(64) })]
 
     #[test]
-    fn beliefs_stay_distributions_and_memory_is_all_there_is(
+    fn beliefs_stay_valid_and_saved_bytes_are_the_whole_state(
         (height, width) in (1_usize..12, 1_usize..12),
         frames in prop::collection::vec(prop::collection::vec(0_u8..6, 144), 1..12),
         paying in 0_usize..7,
@@ -140,7 +140,7 @@ proptest! {
 }
 
 #[test]
-fn cells_that_look_alike_inform_each_other_and_others_do_not() {
+fn only_cells_that_change_together_become_correlated() {
     let shape = shape(5, 5);
     let belief = Belief::everywhere(&[0.5, 0.17, 0.33], shape);
     let model = Model::wildfire();

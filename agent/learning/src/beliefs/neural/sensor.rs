@@ -6,9 +6,9 @@ use ndarray::{Array2, Axis, s};
 /// Minimum probability of a state before normalisation.
 const MIN_PROBABILITY: f64 = 1e-6;
 
-/// Replaces each cell's distribution over observations, `[O, H, W]`, by its distribution over states.
+/// Replaces each cell's distribution over observations, `[O, H, W]`, with its distribution over states.
 ///
-/// `inverse` is the inverse of `P(y | x)`. A network's prediction may not correspond to any distribution over states.
+/// `inverse` is the inverse of `P(y | x)`. Some predictions of a network correspond to no distribution over states.
 /// Therefore, negative values are raised to a small minimum, and the result is normalised.
 pub fn states_from_observations(probabilities: &mut Probabilities, inverse: &Array2<f64>) {
     let (n, height, width) = probabilities.dim();
@@ -26,7 +26,7 @@ pub fn states_from_observations(probabilities: &mut Probabilities, inverse: &Arr
     }
 }
 
-/// Inverts a square matrix by Gauss-Jordan elimination with pivots. Returns `None` if it is singular.
+/// Inverts a square matrix by Gauss-Jordan elimination with pivoting. Returns `None` if it is singular.
 pub fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
     let n = matrix.nrows();
     let mut both = ndarray::concatenate![Axis(1), *matrix, Array2::<f64>::eye(n)];

@@ -40,7 +40,7 @@ fn filter() -> Box<dyn Estimator> {
 }
 
 #[test]
-fn with_a_sensor_an_unlearned_network_is_the_filter() {
+fn with_a_sensor_an_untrained_network_equals_the_filter() {
     let model = emberwatch_model::Model::wildfire();
     let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let mut own = NeuralEstimator::new(&network, Some(filter()), shape())
@@ -59,7 +59,7 @@ fn with_a_sensor_an_unlearned_network_is_the_filter() {
 }
 
 #[test]
-fn many_of_several_networks_predict_together_as_each_alone() {
+fn predictions_together_equal_predictions_alone() {
     let networks = [1, 2].map(|seed| {
         let mut network = NeuralBelief::new(3, seed, &Device::Cpu).expect("a network");
         let lesson = Lesson {
@@ -95,7 +95,7 @@ fn many_of_several_networks_predict_together_as_each_alone() {
 }
 
 #[test]
-fn restored_bytes_are_the_same_belief() {
+fn restored_bytes_result_in_the_same_belief() {
     let (mut first, mut second) = (estimator(), estimator());
     for values in [[0, 1, 2, 255, 255, 255], [255, 2, 255, 1, 255, 0]] {
         first.correct(&frame(&values)).expect("possible");

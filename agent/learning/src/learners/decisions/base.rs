@@ -9,7 +9,7 @@ use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Model, Shape};
 
-/// Finds the belief that decisions are based on, by the setting `decisions.estimator`.
+/// Finds the belief that decisions are based on, given the setting `decisions.estimator`.
 ///
 /// # Errors
 /// If there is no such belief. The error lists all valid names.
@@ -21,7 +21,7 @@ pub fn belief_of(name: &str) -> Result<&'static BeliefKind> {
 /// Finds a belief by its name in a checkpoint. Earlier releases had other names for filters with own-state kernels.
 ///
 /// # Errors
-/// Like [`belief_of`].
+/// Under the same conditions as [`belief_of`].
 pub fn belief_of_saved(name: &str) -> Result<&'static BeliefKind> {
     belief_of(&name.replace("learned_own_", "learned_"))
 }

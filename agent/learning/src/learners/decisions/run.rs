@@ -10,7 +10,7 @@ use emberwatch_network::{Dqn, Track, Transition};
 
 pub(super) struct Run {
     pub(super) rollout: Rollout,
-    /// Features and reward of the last option, until the next features complete the transition.
+    /// Features and reward of the last option, kept until the features of the next step complete the transition.
     pub(super) last: Option<(Vec<f32>, f32)>,
     pub(super) track: Track,
     pub(super) held: Held,
@@ -19,7 +19,7 @@ pub(super) struct Run {
 }
 
 impl Run {
-    /// Creates a run. The agent has been corrected by the first observation.
+    /// Creates a run. The agent's belief must already be corrected with the first observation.
     pub(super) fn begun(rollout: Rollout, dqn: &Dqn) -> Self {
         Self {
             rollout,
@@ -43,7 +43,8 @@ impl Run {
         self.rollout.agent.take_up(option, proposal).moves
     }
 
-    /// Adds the step that led to the given features of all options. Returns the transition that it completes, if any.
+    /// Adds the last step, which led to the given features of all options. Returns the transition that this step
+    /// completes, if any.
     pub(super) fn led_to(&mut self, features: &[f32], dqn: &Dqn) -> Option<Transition> {
         let (input, reward) = self.last.take()?;
         let is_terminated = self.rollout.observation().world.terminated != 0;
@@ -56,7 +57,7 @@ impl Run {
         })
     }
 
-    /// Ends the episode. Returns the transitions of its last steps, which lead to the options of the last state.
+    /// Ends the episode. Returns the transitions of its last steps, which all lead to the options in the final state.
     pub(super) fn end(&mut self, dqn: &Dqn) -> Vec<Transition> {
         let features = features(&self.propose());
         let full = self.led_to(&features, dqn);
@@ -73,7 +74,7 @@ impl Run {
         }
     }
 
-    /// Restores a run from a checkpoint. The agent has not been corrected yet.
+    /// Restores a run from a checkpoint. `rollout` must not have been corrected yet.
     pub(super) fn restore(saved: SavedRun, mut rollout: Rollout, dqn: &Dqn) -> Result<Self> {
         saved.resume_point.restore(&mut rollout.agent)?;
         rollout.agent.memory = saved.memory;

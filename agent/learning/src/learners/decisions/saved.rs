@@ -20,7 +20,7 @@ use std::sync::Arc;
 /// The shape of the DQN: features per option, and number of options.
 pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
 
-/// Upper limit of due updates, above the number that a step of all worlds can add.
+/// Upper limit on due updates. It is above the number that one step of all worlds can add.
 const MAX_EARNED: f64 = 2e6;
 
 /// Maximum number of steps for which an option is held.
@@ -97,7 +97,7 @@ impl SavedBelief {
     }
 }
 
-/// Loads the values for policies: the decisions, and their belief if it was learned. Networks compute on `device`.
+/// Loads the values that policies use: the decisions, and their belief if it was learned. Networks compute on `device`.
 /// Returns whether it replaced different decisions.
 pub(super) fn read(contents: &Contents, device: &Device, learned: &mut Learned) -> Result<bool> {
     let config = contents.settings()?;
@@ -132,7 +132,7 @@ impl SavedDecisions {
         base.transpose()
     }
 
-    /// Loads the learned belief, if any. Networks compute on `device`. Returns whether it replaced a different one.
+    /// Loads the learned belief, if any. Networks compute on `device`. Returns whether it replaced a different belief.
     pub(super) fn read_belief(
         &self,
         contents: &Contents,
@@ -208,7 +208,7 @@ mod tests {
     use emberwatch_model::Frame;
 
     #[test]
-    fn what_is_wrong_with_a_checkpoint_is_named() {
+    fn errors_name_what_is_wrong_with_a_checkpoint() {
         let config = AgentConfig::default();
         let dqn = Dqn::new(config.decisions.settings(), SHAPE, 3);
         let state = SavedDecisions {
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn an_option_is_held_for_a_time_that_settings_may_have() {
+    fn held_options_must_exist_and_last_for_a_valid_time() {
         let shape = Shape::new(2, 3).expect("test shape");
         let observation = Observation {
             world: WorldResult::default(),

@@ -1,4 +1,4 @@
-//! The fit of a filter's parameters to the frames of acting robots. Pure.
+//! Fits a filter's parameters to the frames of acting robots.
 
 mod neighbours;
 
@@ -21,10 +21,10 @@ use serde::{Deserialize, Serialize};
 /// Suffixes of tensor names: parameters, mean gradients and mean squared gradients.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
-/// Upper limit of due updates, above the number that a step of all worlds can add.
+/// Upper limit on due updates. It is above the number that one step of all worlds can add.
 const MAX_EARNED: f64 = 2e6;
 
-/// Learns from frames as they arrive. A checkpoint stores this value, and the tensors separately.
+/// A filter that is fitted to frames as they arrive. A checkpoint stores this struct, and its tensors separately.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct FilterFit {
     pub optimiser: Optimiser,
@@ -51,7 +51,7 @@ impl FilterFit {
         }
     }
 
-    /// Begins a new track of a robot.
+    /// Begins a new track for a robot.
     pub fn begin(&mut self, robot: u32) {
         self.replay.begin(robot);
         self.neighbours
@@ -62,7 +62,8 @@ impl FilterFit {
         self.replay.has_track(robot)
     }
 
-    /// Adds a robot's next frame. `predictor` is the belief before it (not for the first), `learned` the present model.
+    /// Adds a robot's next frame. `predictor` is the belief before it (`None` for the first), and `learned` the current
+    /// model.
     pub fn see(
         &mut self,
         robot: u32,
@@ -75,7 +76,8 @@ impl FilterFit {
         self.neighbours.see(robot, frame, predictor, tables, target);
     }
 
-    /// Records the reward of a path. `posterior` is the belief after its frame, and `paying` has the rewarded cells.
+    /// Records the reward of a path. `posterior` is the belief after its frame, and `paying` contains the rewarded
+    /// cells.
     pub fn earn(&mut self, posterior: &Belief, paying: &[usize], reward: f64) {
         let met = met(posterior, paying.iter().copied());
         self.reward.add(&met, reward);
@@ -86,7 +88,7 @@ impl FilterFit {
     /// Makes the updates that are due after the steps since the last call.
     ///
     /// # Errors
-    /// If a number is not finite. The parameters then remain those of the last successful update.
+    /// If a value is not finite. The parameters then stay as they were after the last successful update.
     pub fn learn(&mut self) -> Result<Vec<Update>> {
         let mut updates = Vec::new();
         let target = self.reward.target();
@@ -163,8 +165,8 @@ impl FilterFit {
         self.reward.check(dimensions.n_states)
     }
 
-    /// Resumes from a checkpoint. The replay buffer is empty if the checkpoint has another grid or other windows than
-    /// the settings.
+    /// Resumes from a checkpoint. The replay buffer starts empty if the checkpoint's grid, windows or streams differ
+    /// from the settings.
     ///
     /// # Errors
     /// If a value is missing or does not fit. The error names it.
@@ -268,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_learner_resumes_alike_unless_its_replay_is_cut_otherwise() {
+    fn a_fit_resumes_exactly_unless_its_streams_differ() {
         let mut fit = fit();
         assert!(fit.n_updates() > 0);
         let stored = contents(&fit);
@@ -286,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn observation_matrices_are_kept_in_checkpoints() {
+    fn checkpoints_keep_observation_matrices() {
         let dimensions = Dimensions {
             n_matrices: 2,
             ..DIMENSIONS
@@ -303,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn the_target_is_the_state_that_was_seen_to_pay() {
+    fn the_target_is_the_state_with_the_highest_reward() {
         let mut fit = fit();
         let states = ndarray::arr2(&[[0, 1, 2]]);
         let belief = Belief::from_states(&states, 3).expect("states");
@@ -312,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused_by_name() {
+    fn errors_name_what_does_not_fit() {
         let other = |change: fn(&mut Dimensions), words: &str| {
             let mut dimensions = DIMENSIONS;
             change(&mut dimensions);

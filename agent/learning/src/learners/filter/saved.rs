@@ -41,8 +41,8 @@ impl SavedRobot {
         }
     }
 
-    /// Whether a world's observation equals the saved one. The world may belong to another server, if its seeds, step,
-    /// flights and sensor noise are the same.
+    /// Whether a world's observation equals the saved one. Worlds on different servers can have equal observations if
+    /// their seeds, steps, flights and sensor noise are the same.
     pub fn is_of(&self, observation: &Observation) -> bool {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }

@@ -17,7 +17,7 @@ use emberwatch_network::{
 };
 use serde::{Deserialize, Serialize};
 
-/// The learned networks and the state of learning. Estimators hold copies of the autoencoder.
+/// The learned networks and the state of learning. Estimators contain copies of the autoencoder.
 #[derive(Debug)]
 pub struct Progress {
     pub autoencoder: Autoencoder,
@@ -35,7 +35,7 @@ pub struct Position {
     pub follower: Follower,
     /// The saved estimate, if paths are planned on it.
     pub estimate: Option<Belief>,
-    /// The latest steps, for the DQN's replay buffer.
+    /// The latest steps, whose transitions are not yet in the DQN's replay buffer.
     pub track: Track,
     pub reward: RewardEstimate,
     pub iterations: u64,
@@ -49,12 +49,12 @@ pub struct SavedNetwork {
     pub shape: Shape,
     /// Number of observation values.
     pub n_observations: usize,
-    /// Number of the autoencoder's Adam steps and of its updates.
+    /// The number of the autoencoder's Adam steps, and the number of its updates.
     pub counters: [u64; 2],
     pub dqn: SavedDqn,
     /// The frames of the replay buffer, oldest first.
     pub frames: Vec<Vec<u8>>,
-    /// Indices of the frames with which tracks begin.
+    /// Index of the first frame of each track.
     pub tracks: Vec<u64>,
     pub position: Position,
 }
@@ -95,7 +95,7 @@ impl Progress {
         reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
-    /// Returns the contents of a checkpoint without its settings. `rollout` has the present follower and place.
+    /// Returns the contents of a checkpoint without its settings. `rollout` provides the current follower and place.
     pub fn to_contents(&self, rollout: &Rollout) -> Result<Contents, NetworkError> {
         let shape = self.autoencoder.shape();
         let frames = self.replay.frames();
@@ -151,7 +151,7 @@ impl Progress {
         }
     }
 
-    /// Loads a checkpoint with the same sizes.
+    /// Loads a checkpoint whose networks have the same sizes.
     pub fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedNetwork = contents.state()?;
         let (mut position, n_updates) = (saved.position, saved.dqn.n_updates);
@@ -198,7 +198,7 @@ impl Progress {
     }
 }
 
-/// Returns the follower of an agent's network after a prediction.
+/// Returns the recurrent state of an agent's network after a prediction.
 pub(super) fn follower(rollout: &Rollout) -> Follower {
     let (agent, hidden) = (&rollout.agent, rollout.agent.estimator().hidden());
     let hidden = hidden.expect("invariant: its estimator is an autoencoder");
@@ -219,7 +219,8 @@ fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> Ne
     }
 }
 
-/// Checks that the file is large enough for the sizes in it. Otherwise, a small file could request all memory.
+/// Checks that the file contains enough values for the sizes that it declares. Otherwise, a small file could exhaust
+/// memory.
 fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<()> {
     let expected = shape.n_numbers();
     let tensors = contents.tensors.values();

@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 /// Average number of steps between changes of behaviour.
 const STEPS: u64 = 20;
 
-/// Time constants in steps: of the value of revisiting a cell with `Cover`, and of the value of a sighting with `Last`.
+/// Time constants in steps: of the value that a seen cell regains for `Cover`, and of the value that a sighting loses
+/// for `Last`.
 const FADING_STEPS: [f32; 2] = [300.0, 100.0];
 
 /// An aim, and the goal cell of the aim `Far`.
@@ -25,17 +26,17 @@ pub struct Behaviour {
 enum Aim {
     /// Random moves.
     Walk,
-    /// Cells that were not seen for long.
+    /// Cells that have not been seen for a long time.
     Cover,
     /// The goal cell.
     Far,
     /// The latest sightings of the observation with the highest reward.
     Last,
-    /// The policy's objective on the belief, plus `entropy` tenths of the belief's entropy.
+    /// The policy's objective on the belief, plus `entropy / 10` times the belief's entropy.
     Exploit { entropy: u8 },
 }
 
-/// Aims with their probabilities in per cent, while exploring and later.
+/// Each aim with its two probabilities in per cent: while exploring, and later.
 const AIMS: [(Aim, [u64; 2]); 8] = [
     (Aim::Walk, [20, 4]),
     (Aim::Cover, [30, 8]),
@@ -48,7 +49,8 @@ const AIMS: [(Aim, [u64; 2]); 8] = [
 ];
 
 impl Behaviour {
-    /// Returns the previous behaviour, or a random one with probability 1 / `STEPS` or if there is none.
+    /// Returns the next behaviour: a random one with probability 1 / `STEPS` or at the beginning, otherwise the
+    /// previous one.
     pub fn next(
         before: Option<Self>,
         is_exploring: bool,
@@ -103,7 +105,7 @@ impl Behaviour {
         }
     }
 
-    /// Computes the values of aims that ignore the belief.
+    /// Computes the value of each cell for an aim that ignores the belief.
     fn value(&self, seen: &Sightings, target: usize, rng: &mut ChaCha8Rng) -> Grid<f32> {
         let shape = seen.shape();
         let (height, width) = shape.dim();
@@ -135,10 +137,10 @@ impl Behaviour {
         match self.aim {
             Aim::Walk => "random moves",
             Aim::Cover => "coverage",
-            Aim::Far => "a far cell",
-            Aim::Last => "what was seen to pay",
-            Aim::Exploit { entropy: 0 } => "what pays",
-            Aim::Exploit { .. } => "what pays, and entropy",
+            Aim::Far => "a distant cell",
+            Aim::Last => "sightings of the highest reward",
+            Aim::Exploit { entropy: 0 } => "the highest reward",
+            Aim::Exploit { .. } => "the highest reward, and entropy",
         }
     }
 
@@ -159,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn chances_are_whole_and_behaviours_last() {
+    fn probabilities_sum_to_one_and_behaviours_persist() {
         for stage in [0, 1] {
             let sum: u64 = AIMS.iter().map(|(_, chances)| chances[stage]).sum();
             assert_eq!(sum, 100);
@@ -183,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn each_aim_is_worth_most_where_it_leads() {
+    fn each_aim_values_its_own_cells_most() {
         let mut seen = Sightings::new(shape());
         let cells = (0..12).filter(|cell| *cell != 7);
         cells.for_each(|cell| seen.see_cell(cell, u8::from(cell == 2)));

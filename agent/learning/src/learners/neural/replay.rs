@@ -51,7 +51,7 @@ impl LessonReplay {
         }
     }
 
-    /// Begins a new track of a robot, without sightings.
+    /// Begins a new track for a robot, without sightings.
     pub fn begin(&mut self, robot: u32, shape: Shape) {
         self.open(robot, Sightings::new(shape));
     }
@@ -77,7 +77,8 @@ impl LessonReplay {
         self.full.extend(ended.into_values());
     }
 
-    /// Adds a robot's next frame. `base` has the observations that the corrected filter predicted, `[O, H, W]`.
+    /// Adds a robot's next frame. `base` is the distribution over observations that the corrected filter predicted,
+    /// `[O, H, W]`.
     ///
     /// # Panics
     /// If the robot has no track.
@@ -99,7 +100,7 @@ impl LessonReplay {
         }
     }
 
-    /// Returns a robot's sightings until now.
+    /// Returns a robot's sightings so far.
     ///
     /// # Panics
     /// If the robot has no track.
@@ -137,13 +138,13 @@ impl LessonReplay {
         *self = Self::new(self.max_frames);
     }
 
-    /// Loads the contents of another buffer. The capacity remains.
+    /// Loads the contents of another buffer. The capacity does not change.
     pub fn resume(&mut self, other: Self) {
         (self.full, self.open) = (other.full, other.open);
     }
 
-    /// Checks a buffer from a checkpoint: its grid, its observations, and that each robot has a track. `has_base` is
-    /// whether each frame needs a filter's predictions.
+    /// Checks a buffer from a checkpoint: its grid, its observations, and that each robot has a track. If `has_base` is
+    /// set, each frame must contain a filter's predictions.
     pub fn check(
         &self,
         shape: Shape,
@@ -217,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lesson_is_a_frame_after_all_that_its_robot_saw_before() {
+    fn a_lesson_contains_all_earlier_sightings_of_its_robot() {
         let replay = replay(300, 1000);
         assert_eq!(
             (replay.full.len(), replay.present(3).last(0)),
@@ -238,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_blocks_go_and_others_are_refused() {
+    fn old_blocks_are_dropped_and_misfits_are_rejected() {
         assert_eq!(replay(1100, 1000).full.len(), 3);
         let replay = replay(300, 1000);
         let check = |n_observations, robots: [u32; 2]| {

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
-/// Upper limit of due updates, above the number that a step of all worlds can add.
+/// Upper limit on due updates. It is above the number that one step of all worlds can add.
 const MAX_EARNED: f64 = 2e6;
 
 /// A checkpoint of a neural belief, without its tensors.
@@ -40,7 +40,7 @@ pub(super) struct SavedRun {
     pub(super) behaviour: Option<Behaviour>,
 }
 
-/// Loads the model for policies. The network computes on `device`.
+/// Loads the model that policies use. The network computes on `device`.
 pub(super) fn read(contents: &Contents, device: &Device) -> Result<NeuralModel> {
     let saved: SavedNeural = contents.state()?;
     let mut network = new_network(saved.n_observations, device)?;

@@ -22,7 +22,7 @@ fn shape() -> Shape {
     worlds().shape()
 }
 
-/// Hidden states, and a frame with the states of some cells.
+/// Returns hidden states, and a frame that shows the states of some cells.
 fn world(step: u64) -> (Grid<u8>, Frame) {
     let states = Grid::from_shape_fn(shape().dim(), |(row, col)| {
         (split_mix(step / 3, (row / 3 * 3 + col / 3) as u64) % 3) as u8
@@ -36,7 +36,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
     (states, frame)
 }
 
-/// An untrained network with the first DQN, by seed, that satisfies a condition.
+/// An untrained network. The seed of its DQN is the lowest with which the DQN satisfies a condition.
 fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
     let mut config = config(basis);
     config.seed = 1;
@@ -59,8 +59,7 @@ fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent>
     super::agent(&policy, config, &conditions, worlds().n_moves, 7)
 }
 
-/// Returns whether the plans of some steps equal the plans on the estimate, and whether they equal the plans on the
-/// predictor.
+/// Returns whether an agent's plans equal the plans on the estimate, and whether they equal the plans on the predictor.
 fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
     let mut agent = agent(policy, config, learned).expect("an agent");
     let mut all = [true; 2];
@@ -81,7 +80,7 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
 }
 
 #[test]
-fn every_policy_plans_on_the_belief_that_settings_say() {
+fn every_policy_plans_on_the_configured_belief() {
     let mut learned = Learned::default();
     learned.put(learned_filter(true));
     learned.put(network(BasisKind::Predictor, |_| true));
@@ -103,7 +102,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
             .map(|belief| plans(policy, &config(belief), &learned));
         assert_eq!(plans, [[true, false], [false, true]], "{policy}");
     }
-    // A clairvoyant always plans on the states that its path will meet.
+    // A clairvoyant always plans on the states that its path will encounter.
     let clairvoyant = plans("clairvoyant_beam", &config(BasisKind::Estimate), &learned);
     assert_eq!(clairvoyant, [false, true]);
 }
@@ -120,7 +119,7 @@ fn decisions(basis: BasisKind) -> LearnedDecisions {
 }
 
 #[test]
-fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
+fn decisions_use_the_belief_that_they_were_learned_with() {
     for (basis, other, expected) in [
         (BasisKind::Estimate, BasisKind::Predictor, [true, false]),
         (BasisKind::Predictor, BasisKind::Estimate, [false, true]),
@@ -139,7 +138,7 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
 }
 
 #[test]
-fn decisions_are_planned_with_the_beam_that_they_were_learned_with() {
+fn decisions_use_the_beam_width_that_they_were_learned_with() {
     let mut config = config(BasisKind::Predictor);
     let mut learned = Learned::default();
     learned.put(decisions(BasisKind::Predictor));
@@ -159,7 +158,7 @@ fn decisions_are_planned_with_the_beam_that_they_were_learned_with() {
 }
 
 #[test]
-fn a_network_decides_on_what_it_was_learned_with() {
+fn a_network_decides_from_the_hidden_vector_after_the_frame() {
     let learned = network(BasisKind::Predictor, |_| true).autoencoder;
     let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");
     let before = estimator.hidden().expect("a vector").to_vec();

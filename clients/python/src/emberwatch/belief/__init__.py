@@ -48,9 +48,9 @@ class Filters:
         _, _, height, width = self._prior.shape
         self._transition = Transition(model, height=height, width=width, n_worlds=n_worlds)
         self._likelihood = np.ascontiguousarray(model.observation_matrix)
-        #: The posterior ``p_k``, given the frames up to the last.
+        #: The posterior ``p_k``, given all frames so far.
         self.posterior = np.repeat(self._prior, n_worlds, axis=1)
-        #: The predictor ``u_{k+1}``, about the states that the next paths meet.
+        #: The predictor ``u_{k+1}``: the belief about the states that the next paths will observe.
         self.predictor = self.posterior
 
     def reset(self, indices: Sequence[int], frames: NDArray[np.uint8]) -> None:
@@ -85,14 +85,14 @@ class Transition:
 
     ``phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] x[n, i + a - A, j + c - C]`` with
     (A, C) the centre of the kernel (eq. 2), then divided by its sum over ``m`` (eq. 3). Outside the
-    grid ``x`` is zero, or one in the model's `edge` state.
+    grid ``x`` is zero. If the model has an `edge` state, ``x`` is one in that state instead.
 
     A model whose weights depend on the cell's own state ``o`` has a kernel for each ``o``. Its
     ``phi[m | o]`` uses the kernel of ``o``, whose centre sees ``o`` itself, and
     ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``. This is a mean field: it treats neighbours
     as independent, as the filter does.
 
-    Threads must not share one, as it keeps work space.
+    Threads must not share an instance, because it reuses scratch memory.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Every kind of belief that the Rust agent has, with bit-identical numbers.
+"""Every kind of belief that the Rust agent has, with bit-identical results.
 
 `known` makes a `Belief` from a model, `load` from a checkpoint.
 """
@@ -50,8 +50,8 @@ def known(
 
     Raises:
         InvalidArgumentError: If the prior does not have the model's states, or is not a
-            distribution in some cell; if the kind does not exist or is a learned one; or if all
-            weights of the model can be 0.
+            distribution in some cell; if the kind does not exist or is a learned one; or if the
+            weights of all next states of a cell can be 0 at once.
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
     model = model if isinstance(model, Model) else Model.named(model)
@@ -72,10 +72,10 @@ def load(
 ) -> "Belief":
     """Loads a learned belief from a checkpoint of `emberwatch-agent train`.
 
-    A learner chooses the order of its states: `Belief.state_names` are ``"state 0"`` and so on, and
-    `Belief.target_state` is the number of the state that pays most. A neural belief predicts
-    observed values instead of states, so S = O. ``"neural+sensor"`` infers the states from them
-    with the observation matrix of `model`.
+    A learned belief has its own order of states: `Belief.state_names` are ``"state 0"`` and so on,
+    and `Belief.target_state` is the number of the state that pays most. A neural belief predicts
+    observed values instead of states, so S = O. ``"neural+sensor"`` infers the states from these
+    values with the observation matrix of `model`.
 
     Args:
         checkpoint: Path of the file. Filters and neural beliefs fit any grid, an autoencoder only
@@ -91,7 +91,7 @@ def load(
 
     Raises:
         InvalidArgumentError: If the file is not a complete checkpoint, does not fit the kind, the
-            grid or the model, or holds decisions on the belief of a known model.
+            grid or the model, or contains decisions trained on the belief of a known model.
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
     if model is not None and not isinstance(model, Model):
@@ -114,11 +114,11 @@ class Belief:
     - Frames have shape (H, W), beliefs (S, H, W). With `n_worlds`, frames have shape
       (n_worlds, H, W) and beliefs (S, n_worlds, H, W). Methods then accept `worlds`: a mask,
       indices, or a slice. None selects all worlds.
-    - Numbers are single precision, bit-identical to the Rust agent's. Outputs of networks may
+    - Values are single precision, bit-identical to the Rust agent's. Outputs of networks may
       differ between processors.
-    - Kinds with `+spatial` learn how cells vary together while they run, for each world
-      separately, so that earlier frames improve later corrections. `reset` discards this, except
-      for what came from a checkpoint, unless `keep_correlations` is true.
+    - Kinds with `+spatial` learn correlations between cells while they run, separately for each
+      world, so that earlier frames improve later corrections. `reset` discards them, except for
+      correlations loaded from a checkpoint, unless `keep_correlations` is true.
 
     Only one thread at a time may use a belief.
     """
@@ -130,7 +130,7 @@ class Belief:
 
     @property
     def kind(self) -> str:
-        """The name of its kind, a key of `kinds`."""
+        """The kind of this belief, a key of `kinds`."""
         return self._native.kind
 
     @property
@@ -169,12 +169,12 @@ class Belief:
     def reset(
         self, worlds: ArrayLike | slice | None = None, *, keep_correlations: bool = False
     ) -> None:
-        """Resets the belief to the one before the first frame.
+        """Resets the belief to its state before the first frame.
 
         Args:
             worlds: The worlds to reset.
-            keep_correlations: Whether kinds with `+spatial` keep the learned correlations of
-                cells. No effect on other kinds.
+            keep_correlations: Whether kinds with `+spatial` keep the learned correlations
+                between cells. No effect on other kinds.
         """
         keeps = as_flag(keep_correlations, "keep_correlations")
         self._native.reset(self._chosen(worlds), keeps)
@@ -188,8 +188,8 @@ class Belief:
             worlds: The worlds to correct.
 
         Raises:
-            InvalidArgumentError: If the frames do not have the belief's shape, type or observed
-                values. No belief changes.
+            InvalidArgumentError: If the frames have another shape, type or range of values than
+                the belief expects. No belief changes.
             EmberwatchError: Code ``"impossible_frame"``, if a frame has probability 0 under the
                 belief. That world keeps its belief; the other worlds are corrected.
         """
@@ -202,11 +202,11 @@ class Belief:
     def score_states(
         self, states: NDArray[np.uint8], *, target: int | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Returns log loss, Brier score and accuracy, which `score` defines, for hidden states.
+        """Scores the belief against hidden states: log loss, Brier score and accuracy.
 
-        Each is a number, or has shape (n_worlds,). `states` has the shape and type of frames, and
-        values below S. `target` is the number in `states` of the state that pays most; None: the
-        belief's own.
+        `BeliefScores` defines the scores. Each is a number, or has shape (n_worlds,). `states` has
+        the shape and type of frames, and values below S. `target` is the value in `states` of the
+        state that pays most; None: `target_state`.
         """
         figures = self._native.scores(self._frames(states, "states"), target_of(self, target))
         losses, briers, accuracies = (self._of_worlds(figure) for figure in figures)
@@ -224,7 +224,7 @@ class Belief:
         return self._of_worlds(sums), self._of_worlds(n_seen)
 
     def _frames(self, frames: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-        """Checks frames or states, and gives them an axis for worlds."""
+        """Checks frames or states, and adds an axis for worlds if they have none."""
         given = as_array(frames, name, "an array")
         if given.shape != self.shape or given.dtype != np.uint8:
             got = f"{given.shape} and {given.dtype}"
@@ -254,7 +254,7 @@ class Belief:
 
 
 def target_of(belief: Belief, target: int | None) -> int:
-    """Checks the number of a target state; None stands for the belief's own."""
+    """Checks the index of a target state; None stands for the belief's `target_state`."""
     names = belief.state_names
     number = belief.target_state if target is None else as_integer(target)
     if number is not None and not isinstance(target, bool) and 0 <= number < len(names):

@@ -23,7 +23,7 @@ class Merit:
     steps_to_detection: int | None
     #: Number of burning cells of the world in that step.
     burning_cells_at_detection: int | None
-    #: Share of the burning cells that count as seen, which a robot visited in the last
+    #: Share of the burning cells that count as seen, because a robot visited them in the last
     #: `recent_steps` steps. Mean over the steps with fire.
     burning_seen_share: float | None
     #: Smallest number of moves from a robot to a burning cell that does not count as seen. Mean

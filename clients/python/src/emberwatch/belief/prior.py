@@ -19,7 +19,7 @@ _SUM_TOLERANCE = 5e-5
 
 
 def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
-    """Returns the model's distribution at the start of the burn-in in each cell, (S, H, W)."""
+    """Returns the model's initial distribution, before the burn-in, in each cell; (S, H, W)."""
     return np.tile(model.initial[:, None, None], (1, height, width))
 
 
@@ -52,7 +52,7 @@ def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
 
 @functools.lru_cache(maxsize=8)
 def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
-    """Returns how often each cell of 64 simulated worlds is in each state after the burn-in.
+    """Returns the share of 64 simulated worlds with each cell in each state after the burn-in.
 
     Shape (S, H, W), read-only: calls with the same arguments share the array. The seeds of these
     worlds are fixed and belong to no environment. The agent starts from the same prior. The first

@@ -34,7 +34,7 @@ class BeliefScores:
         """Returns the mean of each score over the steps, by name.
 
         Each is a number, or has shape (n_worlds,). All steps have the same weight, except in
-        `predicted_log_loss`, where all observed cells have.
+        `predicted_log_loss`, where all observed cells have the same weight.
         """
         figures = ("log_loss", "brier", "accuracy")
         means: dict[str, Any] = {name: getattr(self, name).mean(axis=0) for name in figures}
@@ -57,18 +57,18 @@ def score(
     with this frame, scores the posterior against state k, and predicts step k + 1. The posterior is
     scored in all cells, observed or not.
 
-    A learner chooses the order of its states. The `log_loss` and `accuracy` of its belief are
-    meaningful only if this order agrees with `states`. `brier` compares the probability of the
-    belief's own target state with the cells where `states` equals `target`.
+    A learned belief has its own order of states. Its `log_loss` and `accuracy` are meaningful only
+    if this order agrees with `states`. `brier` compares the probability of the belief's
+    `target_state` with the cells where `states` equals `target`.
 
     Args:
-        belief: A belief of `known` or `load`, for one world, or for one world per sequence.
+        belief: A belief from `known` or `load`, for one world, or for one world per sequence.
         observations: Frames, type uint8, shape (K, H, W) or (K, n_worlds, H, W), 255 in unobserved
             cells. K is at least 1.
         states: Hidden states of the same shape and type, below S.
-        target: The number in `states` of the state that pays most; None: the belief's own.
-        keep_correlations: As in `Belief.reset`: whether kinds with `+spatial` keep correlations
-            learned on earlier sequences.
+        target: The value in `states` of the state that pays most; None: `belief.target_state`.
+        keep_correlations: Whether kinds with `+spatial` keep the correlations that they have
+            learned on earlier sequences, as in `Belief.reset`.
 
     Raises:
         InvalidArgumentError: If an array does not have the belief's shape, type or values, or

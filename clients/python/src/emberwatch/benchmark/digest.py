@@ -1,7 +1,7 @@
 """Digests of policies, which detect whether the rows in a file come from the same policy.
 
-A digest pickles and changes nothing. Of a value that cannot be read, only the name of its type
-counts. Data that a function reads at run time, such as a file, is not part of the digest.
+Computing a digest neither pickles nor changes a value. If a value cannot be read, only the name of
+its type is hashed. Data that a function reads at run time, such as a file, is not hashed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum depth of nested values, and number of values. Beyond these, only names of types count.
+#: Maximum depth and number of nested values. Beyond these, only the names of types are hashed.
 _DEPTH: Final = 24
 _PARTS: Final = 50_000
 
@@ -29,7 +29,7 @@ _SEQUENCES: Final = (list, tuple)
 #: Methods that return all weights of a model, in Stable-Baselines3, PyTorch and Keras.
 _WEIGHTS: Final = ("get_parameters", "state_dict", "get_weights")
 
-#: Class attributes that Python adds to what the author wrote.
+#: Class attributes that Python adds to the ones that the author wrote.
 _OF_CLASSES: Final = frozenset(
     ("__annotations__", "__dict__", "__doc__", "__firstlineno__", "__module__", "__qualname__")
     + ("__static_attributes__", "__weakref__", "_abc_impl")
@@ -41,7 +41,7 @@ _PACKAGES: Final = frozenset(("site-packages", "dist-packages"))
 
 
 def digest(value: object) -> str:
-    """Returns 16 hexadecimal digits that differ if two values differ visibly.
+    """Returns 16 hexadecimal digits. Values with visible differences have different digests.
 
     The digest of a model covers its weights. The digest of a function covers its code, defaults,
     closure, and the globals that it names. The digest of another object covers its attributes:
@@ -139,7 +139,7 @@ def _array(value: Any) -> NDArray[Any] | None:
 
 
 def _of_function(function: FunctionType) -> Iterable[object]:
-    """Yields the parts of a function that its result depends on."""
+    """Yields the parts of a function that determine its result."""
     yield function.__defaults__
     yield function.__kwdefaults__
     for cell in function.__closure__ or ():
@@ -214,7 +214,7 @@ def _settings(model: Any) -> object:
 
 
 def _numbers(module: object) -> dict[str, object]:
-    """Returns the settings of a PyTorch module, except `training`, which predictions change."""
+    """Returns the settings of a PyTorch module, except `training`, which a prediction may set."""
     return {
         name: value
         for name, value in vars(module).items()

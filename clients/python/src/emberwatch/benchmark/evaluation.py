@@ -74,8 +74,8 @@ def evaluate(
     Args:
         policy: A function that maps stacked observations of several worlds to their actions, or a
             model of Stable-Baselines3 or another object with the same `predict`. Recurrent models
-            get their state back, and `episode_start` is true in the first step of each world. A
-            function or `predict` with a parameter `action_masks` gets the masks of the worlds,
+            receive their state back, and `episode_start` is true in the first step of each world. A
+            function or `predict` with a parameter `action_masks` receives the masks of the worlds,
             `(n_worlds, 4)` booleans. If a model was trained behind `VecNormalize` and still has it
             (`get_vec_normalize_env`), its observations are normalized. If the policy has a method
             `begin(n_worlds)`, it is called before each batch of worlds.
@@ -89,24 +89,24 @@ def evaluate(
         estimator: The name of the policy's belief in the table; None: `known_model` if
             `observation` has a belief, otherwise `none`.
         deterministic: Argument of `predict`.
-        batch: Number of worlds at a time, in the order of the seeds.
+        batch: Number of worlds to simulate at the same time, in the order of the seeds.
         recent_steps: Number of steps for which a cell counts as seen after a visit, in the figures
-            of merit. Figures that need the hidden states are None with `truth=False`, or if a
-            running server does not publish the states, or hides its model or the description of
-            recorded worlds.
-        wrap: A function that wraps the worlds, a `VecEnv` of Stable-Baselines3, as in the policy's
-            training: `lambda worlds: VecFrameStack(worlds, 4)`. For a saved model with normalized
+            of merit. Figures that need the hidden states are None with `truth=False`. They are also
+            None if a running server does not publish the states, or hides its model or its
+            description of recorded worlds.
+        wrap: A function that wraps the worlds, a `VecEnv` of Stable-Baselines3, as the training
+            did: `lambda worlds: VecFrameStack(worlds, 4)`. For a saved model with normalized
             observations: `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`. The
             evaluation does not change the statistics.
         csv: A file to write rows to. Several processes may write to it. Rows of this policy in the
-            file are reused instead of run again if worlds, settings and policy are the same. Of
-            the policy, this compares the weights of a model, or the code and the values that
-            functions refer to. Rows that differ are run again and replaced. Rows of other policies
-            are kept. A file with rows of other worlds is refused.
-        progress: The stream for progress and for notes on reused rows; None: none.
+            file are reused instead of run again if worlds, settings and policy are the same. Models
+            are compared by their weights, functions by their code and the values that they refer
+            to. Rows that differ are run again and replaced. Rows of other policies are kept. A file
+            with rows of other worlds is refused.
+        progress: The stream for progress and for notes on reused rows; None: no output.
         keywords: Keywords of the environment, such as `task`, `model`, `height`, `n_moves` and
-            `observation`. With `robots`, the policy acts for all robots of each world, and rows of
-            its observations and actions are robots.
+            `observation`. With `robots`, the policy acts for all robots of each world, and each
+            row of its observations and actions is one robot.
 
     Returns:
         One row for each seed, in order.
@@ -166,8 +166,8 @@ def suite(
     """Scores a policy on the test worlds of tasks, for `emberwatch-agent suite --out FOLDER`.
 
     Args:
-        policy: A policy of `evaluate` for all tasks, or a mapping from the name of each task to its
-            policy.
+        policy: A policy as in `evaluate`, for all tasks; or a mapping from the name of each task to
+            its policy.
         name: The policy's name in tables.
         folder: The folder of the rows, with a CSV file for each task. Rows of this policy are
             reused as in `evaluate`. If the worlds of a task have changed, this policy's rows of
@@ -215,7 +215,7 @@ class _Setting:
     keywords: dict[str, Any]
     n_robots: int
     wrap: Callable[[Any], Any] | None
-    #: Identifies the worlds; None: unknown, as rows are not written to a file.
+    #: Identifies the worlds. None if rows are not written to a file, which would need it.
     fingerprint: str | None = None
 
     @contextmanager
@@ -252,10 +252,10 @@ def _served(instance: str | None) -> ServerInfo | None:
 
 
 def _check_policy(setting: _Setting, actor: Actor) -> list[Any]:
-    """Refuses worlds that a policy cannot act in, without a reset.
+    """Refuses worlds that a policy cannot act in. Does not reset the worlds.
 
     Returns:
-        The statistics of the normalizations of observations.
+        The statistics with which observations are normalized.
     """
     with setting.made(1) as (worlds, shown):
         normalizers = actor.normalizers if setting.wrap is None else shown.normalizers
@@ -279,7 +279,7 @@ def _policy_fingerprint(setting: _Setting, *acts_on: object) -> str:
 
 
 def _worlds_fingerprint(keywords: Mapping[str, Any], served: ServerInfo | None) -> str:
-    """Returns the fingerprint of the worlds, which does not depend on seeds; simulates nothing."""
+    """Returns the fingerprint of the worlds, the same for all seeds, without simulating them."""
     if served is None:
         world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
         return _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))

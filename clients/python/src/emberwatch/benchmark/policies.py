@@ -21,7 +21,7 @@ from emberwatch.errors import InvalidArgumentError, invalid
 #: A function from stacked observations to actions, or a model of SB3.
 Policy: TypeAlias = Callable[..., Any]
 
-#: Arguments that a policy gets if it has parameters of these names.
+#: Arguments that a policy receives if it has parameters with these names.
 _STATE: Final = "state"
 _STARTS: Final = "episode_start"
 _DETERMINISTIC: Final = "deterministic"
@@ -56,7 +56,7 @@ class Actor:
         if not callable(self._call):
             expected = "a function of observations, or a model of Stable-Baselines3"
             raise invalid("policy", expected, repr_of(policy))
-        # The model, also if the policy is one of its methods.
+        # If the policy is a method of a model, this is the model.
         self._model: Any = getattr(policy, "__self__", policy)
         self._begin: Any = getattr(policy, "begin", None)
         self._deterministic: Final = deterministic
@@ -137,7 +137,7 @@ def statistics(normalizer: Normalizer) -> dict[str, Any]:
 
 
 def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], set[str]]:
-    """Returns a policy's parameters that are known here, and the ones without a default."""
+    """Returns the names of the arguments to pass to a policy, and of the ones without a default."""
     try:
         parameters = list(inspect.signature(call).parameters.values())
     except (TypeError, ValueError):  # written in C

@@ -18,7 +18,7 @@ from emberwatch.common.arguments import repr_of
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 
-#: Seconds to wait for another writer, and between two attempts. Writers hold the lock for
+#: Seconds to wait for another writer, and seconds between attempts. Writers hold the lock for
 #: milliseconds, but `emberwatch-agent compare --csv` holds it until it ends.
 _PATIENCE: Final = 60.0
 _INTERVAL: Final = 0.02
@@ -66,7 +66,7 @@ class Found:
 class RowFile:
     """Rows in a CSV file. Each change locks the file, rereads it, and replaces it as a whole.
 
-    The lock is `flock` on the file itself, so that no writer loses the rows of another one.
+    The lock is `flock` on the file itself, so that no writer overwrites another writer's rows.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, is_cache: bool = False) -> None:
@@ -74,8 +74,8 @@ class RowFile:
 
         Args:
             path: The file, which may be missing or empty.
-            is_cache: Whether to accept rows on other worlds: rows of the policy are replaced, and
-                rows of other policies are left alone. Without it, both are refused.
+            is_cache: Whether to accept rows on other worlds. If so, rows of the policy are
+                replaced, and rows of other policies stay. Otherwise, both are refused.
         """
         if not isinstance(path, str | os.PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise invalid("csv", "the path of a file", repr_of(path))
@@ -97,7 +97,7 @@ class RowFile:
             try:
                 with self._locked():
                     self._rows = read(self.path)
-                    # A folder that refuses new files is found before the work, not after it.
+                    # Detects a folder that refuses new files before the work instead of after it.
                     self._temporary.touch()
                     self._temporary.unlink()
             except OSError:

@@ -40,7 +40,7 @@ class Row:
     brier: str
     #: Moves of a path.
     moves: int
-    #: Robots of the world; the numbers above are for all of them together.
+    #: Robots of the world. The values above are for all robots together.
     robots: int = 1
     #: What the robots share: `alone` (nothing), `shared` (what they see), or a word of your choice.
     team: str = "alone"
@@ -55,11 +55,11 @@ class Row:
     recent_steps: int | None = None
     #: Mean share of the burning cells that count as seen.
     burning_seen_share: float | None = None
-    #: Mean of the smallest number of moves from a robot to a burning cell that does not count so.
+    #: Mean smallest number of moves from a robot to a burning cell that does not count as seen.
     front_distance: float | None = None
     #: Share of the grid that a robot visited at any time.
     grid_seen_share: float | None = None
-    #: Mean of ln P of a visited cell's observation. None in rows of Python.
+    #: Mean of ln P(y) over the observations y of visited cells. None in rows of Python.
     log_likelihood: float | None = None
     #: Identifies the worlds apart from their seeds. Equal for two rows if and only if model, grid,
     #: moves, robots, sensor, start and burn-in are equal. Empty in rows of old files.

@@ -1,4 +1,4 @@
-"""Worlds behind wrappers of Stable-Baselines3, which importing this needs."""
+"""Worlds behind wrappers of Stable-Baselines3, which this module imports."""
 
 # Stable-Baselines3 need not be installed where types are checked.
 # pyright: reportMissingImports=false, reportMissingModuleSource=false, reportUnknownMemberType=false

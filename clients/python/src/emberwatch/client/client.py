@@ -36,10 +36,10 @@ _Connection = TypeVar("_Connection")
 
 _log: Final = logging.getLogger("emberwatch")
 
-#: Milliseconds since its last use after which a lease on worlds in this process expires.
+#: Milliseconds without use after which a lease on worlds in this process expires.
 _EMBEDDED_LEASE: Final = 86_400_000
 
-#: Seconds to sleep between two attempts to connect: after the first attempt, and at most.
+#: Seconds to sleep after the first attempt to connect, and maximum between later attempts.
 _FIRST_RETRY: Final = 0.005
 _RETRY: Final = 0.2
 
@@ -62,14 +62,14 @@ class Client(ServerConnection):
         """Acquires the right to fly consecutive robots. Waits until their worlds end their burn-in.
 
         Robot r of world w has number w R + r, with R = `info.n_robots`. To resume an episode that
-        another agent left, continue from `lease.observe()`, which has k, the robot's cell and the
-        last frame. To begin a new episode, call `lease.reset()`.
+        another agent left, continue from `lease.observe()`, which returns k, the robot's cell and
+        the last frame. To begin a new episode, call `lease.reset()`.
 
         Args:
             first_robot: The number of the first robot.
             n_robots: Number of robots.
             takeover: Whether to take robots away from the clients that hold them.
-            ttl: Seconds since its last use after which the lease expires; None: the server's
+            ttl: Seconds without use after which the lease expires; None: the server's
                 default.
             timeout: Seconds to wait for the answer.
 
@@ -97,7 +97,7 @@ class Client(ServerConnection):
         team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """Returns the results and frames of an earlier step k of the episode, like `observe`.
+        """Returns the results and frames of an earlier step k of the episode.
 
         Args:
             step: The step k.
@@ -141,9 +141,9 @@ class Client(ServerConnection):
         return records(WorldInfo, self.control(request, timeout=timeout))
 
     def belief(self, robot: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
-        """Returns the belief about the current step that a robot's last agent left; None if none.
+        """Returns the belief about the current step that a robot's last agent left, or None.
 
-        Another agent resumes with it; see `Lease.leave_belief`.
+        Another agent can resume with this belief; see `Lease.leave_belief`.
         """
         data, first = b"", None
         while True:
@@ -203,8 +203,8 @@ def connect(
 def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
     """Creates worlds inside this process, without a server, and returns a `Client` of them.
 
-    No other process can observe these worlds or fly in them, and they end with the client. Results
-    that depend only on seeds and actions are the same bytes as a server's. Leases expire a day
+    No other process can observe these worlds or fly in them, and closing the client ends them.
+    Results that depend only on seeds and actions are byte for byte a server's. Leases expire a day
     after their last use. Ctrl-C interrupts the wait for a reset or a file; during a step it takes
     effect after the step.
 
@@ -223,9 +223,9 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
 
 
 def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
-    """Like `embed`; `warns`: whether to warn about start cells that no-fly cells enclose.
+    """Does what `embed` does. `warns`: whether to warn about start cells that no-fly cells enclose.
 
-    Callers that have checked the settings pass False, as the check has warned.
+    Callers that have checked the settings pass False, because the check has already warned.
     """
     # No other client waits for these robots.
     chosen: dict[str, object] = {"lease_millis": _EMBEDDED_LEASE}

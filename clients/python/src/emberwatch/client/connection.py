@@ -22,10 +22,10 @@ CLIENT: Final = f"emberwatch-python {VERSION}"
 
 
 class Closable:
-    """An object with `close`, which `with` calls."""
+    """An object with a `close` method, which the end of a `with` block calls."""
 
     def close(self) -> None:
-        """Closes it. May be called again."""
+        """Closes the object. May be called again."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -36,7 +36,7 @@ class Closable:
 
 
 class Connection(Closable):
-    """A channel of JSON messages. Threads may share it, and wait for each other."""
+    """A channel of JSON messages. Threads may share it; requests run one at a time."""
 
     def __init__(self, instance: str, native: _native.Server) -> None:
         self.instance: Final = instance

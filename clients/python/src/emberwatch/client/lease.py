@@ -22,8 +22,8 @@ _BELIEF_PART: Final = 1 << 19
 class Lease:
     """The right to fly consecutive robots. It ends with `release`, or on leaving its `with` block.
 
-    The lease keeps the step k of each world: the last one that it stepped to, reset to or observed.
-    A path is for the step after this one, and the server flies it in no other step.
+    For each world, the lease remembers the step k that it last stepped to, reset to or observed. A
+    path is for step k + 1, and the server flies it in no other step.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class Lease:
         self.client: Final = client
         #: The lease's number on the server.
         self.number: Final = grant.lease
-        #: Seconds since its last use after which the lease expires.
+        #: Seconds without use after which the lease expires.
         self.ttl: Final = grant.ttl_millis / 1000
         #: The numbers of its robots.
         self.robots: Final = robots
@@ -62,8 +62,8 @@ class Lease:
         Args:
             paths: Moves: 0 up, 1 down, 2 left, 3 right. Integers of shape (n_robots, T), or (T,)
                 for one robot.
-            robots: The numbers of consecutive robots to fly: all robots that the lease has in some
-                of its worlds. None: all robots of the lease.
+            robots: The numbers of consecutive robots to fly, which must be all the lease's robots
+                in one or more worlds. None: all robots of the lease.
             full: Whether to observe every cell. Requires a server with coverage "client" or "full".
             team: Whether to return one frame for each world's team instead of one for each robot.
             timeout: Seconds to wait for the answer.
@@ -71,7 +71,7 @@ class Lease:
         Raises:
             InvalidArgumentError: If the paths do not have this shape, type and range.
             LeaseLostError: If the lease expired or a robot was taken over.
-            RequestTimeoutError: If no answer comes; `observe` shows whether the step was made.
+            RequestTimeoutError: If no answer arrives; `observe` shows whether the step was made.
             ServerGoneError: If the server ended.
             EmberwatchError: With code `"late"` if the world moved on without this path; `observe`
                 shows to which step. With code `"episode_over"`: reset that world.
@@ -92,7 +92,7 @@ class Lease:
         accepts_late: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> tuple[StepAnswer, int]:
-        """Flies one path with each robot, like `step`, and waits however long teammates take.
+        """Flies one path with each robot as `step` does, but waits as long as teammates take.
 
         After each timeout it observes whether the worlds have moved, and sends the paths again if
         not. It waits as long as the server answers. If another thread's paths moved a world, the
@@ -103,10 +103,10 @@ class Lease:
             robots: As in `step`.
             accepts_late: Whether to return the current results of a world that moved on without
                 these paths, instead of raising the error with code `"late"`.
-            timeout: Seconds until it observes. The server's own deadline for teammates is added.
+            timeout: Seconds until `fly` observes, plus the server's own deadline for teammates.
 
         Returns:
-            The results and frames, and the number of steps that the worlds made unobserved before.
+            The results and frames, and the number of earlier world steps that went unobserved.
 
         Raises:
             RequestTimeoutError: If the server does not answer the observation either.
@@ -118,7 +118,7 @@ class Lease:
     def fly_from(
         self, paths: ArrayLike, first: int, n_robots: int, accepts_late: bool, timeout: float
     ) -> tuple[StepAnswer, int]:
-        """Like `fly`, for `n_robots` consecutive robots of the lease from number `first` on."""
+        """Does what `fly` does, for `n_robots` robots of the lease from number `first` on."""
         flown = self.native.fly(paths, first, n_robots, accepts_late, timeout)
         if flown is None:
             moves = as_moves(paths, n_robots, self.client.info.n_moves)
@@ -175,12 +175,12 @@ class Lease:
         first: int = 0,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Replaces worlds of the lease with worlds of a snapshot file, which continue bit for bit.
+        """Replaces worlds of the lease with worlds of a snapshot file, which then continue exactly.
 
         Args:
             path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
             worlds: The consecutive worlds to replace; None: all worlds of the lease.
-            first: The file's world that replaces the first of them; the next ones follow.
+            first: The number of the first world in the file to use; the next worlds follow.
             timeout: Seconds to wait for the answer.
 
         Returns:
@@ -213,10 +213,10 @@ class Lease:
         robot: int | None = None,
         timeout: float = STEP_TIMEOUT,
     ) -> None:
-        """Stores bytes about the current step for a robot's next client, for `Client.belief`.
+        """Stores a belief about the current step for a robot's next client; see `Client.belief`.
 
         Args:
-            result: The robot's last result. The server refuses another step than the current one.
+            result: The robot's last result. The server refuses results of any but the current step.
             kind: The format of the bytes, for other agents. At most 256 bytes.
             data: At most 32,768 bytes plus 76 per cell; more if the model has over 18 states.
             robot: The robot's number; None: the first robot of the lease.

@@ -29,9 +29,9 @@ class RobotFrame:
     """The path and the frame of one robot in one step. Arrays are copies."""
 
     result: RobotResult
-    #: Its frame, `(H, W)`: the observed value of each cell, 255 in unobserved cells.
+    #: The robot's frame, `(H, W)`: the observed value of each cell, 255 in unobserved cells.
     frame: NDArray[np.uint8]
-    #: The moves that it flew, `(n_moves,)`; empty after a reset, or if it stayed.
+    #: The moves that the robot flew, `(n_moves,)`; empty after a reset, or if it hovered.
     path: NDArray[np.uint8]
 
 
@@ -93,13 +93,13 @@ class Outlook:
     step: int
     #: Seed of the episode.
     seed: int
-    #: The belief about X_k after its frame, `(S, H, W)`, probabilities; a copy.
+    #: The posterior belief about X_k, `(S, H, W)`, probabilities; a copy.
     belief: NDArray[np.float32]
     #: Names of the S states.
     states: tuple[str, ...]
     #: Name of the agent's policy.
     policy: str
-    #: Name of the estimator that keeps the belief.
+    #: Name of the estimator that computes the belief.
     belief_from: str
     #: The objective of the last path.
     objective: str
@@ -126,7 +126,7 @@ class Reader(Closable, Generic[_Sample]):
         self._native.close()
 
     def receive(self, timeout: float) -> _Sample | None:
-        """Returns the next sample; `None` if none comes within `timeout` seconds."""
+        """Returns the next sample; `None` if none arrives within `timeout` seconds."""
         fields = self._native.receive(timeout)
         return None if fields is None else self._made(fields)
 
@@ -148,7 +148,7 @@ class Observer(Reader[Frame]):
         self._timeout = timeout
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields frames as they come, until none comes for `timeout` seconds (None: for ever)."""
+        """Yields frames as they arrive, until none arrives for `timeout` seconds (None: never)."""
         while True:
             # Waits an hour at a time: an infinite wait would overflow.
             frame = self.receive(3600.0 if self._timeout is None else self._timeout)
@@ -213,8 +213,8 @@ class Newest(Generic[_Step]):
             now = time.perf_counter()
             if now - begin > timeout:
                 raise RequestTimeoutError(f"the step was not published within {timeout} s")
-            # If this reader lost samples, the ones it waits for may be among them: a new reader
-            # receives the current sample of each world. Without losses it waits longer each time.
+            # If this reader lost samples, the awaited ones may be among them. A new reader
+            # receives the current sample of each world. Without losses, the wait doubles each time.
             if now - asked > (_RETRY if n_lost else _RETRY * 2**n_asked):
                 self.close()
                 asked, n_asked, n_lost = now, n_asked + 1, 0
@@ -263,7 +263,7 @@ def observe(
     """Observes an instance. Returns an iterator of frames, which is also a context manager.
 
     The server publishes the current frame of every world when an observer connects, so the same
-    step of the same episode may come twice.
+    step of the same episode may arrive twice.
 
     Args:
         instance: The instance's name. Its server may start later.

@@ -63,7 +63,7 @@ class ServerInfo:
     coverage: str
     #: Whether the server publishes the hidden states.
     publish_truth: bool
-    #: Default time since its last use after which a lease expires, milliseconds.
+    #: Default time without use after which a lease expires, milliseconds.
     lease_millis: int
     #: How long a step waits for the other robots after its first path, milliseconds; 0: as long as
     #: other clients hold them.
@@ -90,7 +90,7 @@ class ServerInfo:
 
     @property
     def shape(self) -> Shape:
-        """The numbers that determine the layout of this server's answers."""
+        """The sizes that determine the layout of this server's answers."""
         return Shape(self.n_robots, self.height, self.width)
 
 
@@ -114,7 +114,7 @@ class WorldInfo:
 class WorldStatus(WorldInfo):
     """The status of one world in a `ServerStatus`."""
 
-    #: Process ID of the client that holds each robot; None if none does.
+    #: Process ID of the client that holds each robot; None if no client holds it.
     holder_pids: tuple[int | None, ...]
     #: Number of paths received for the next step.
     n_paths: int
@@ -247,7 +247,7 @@ def _as_tuples(value: Any) -> Any:
 def _types(kind: type[Any]) -> dict[str, Any]:
     """Returns the accepted type of each field of a record.
 
-    A tuple may hold anything, and a float may be any number.
+    A tuple may contain values of any type, and a float field accepts any number.
     """
     wider = {float: int | float}
     return {

@@ -19,7 +19,7 @@ RECALL: Final = 3
 FULL_COVERAGE: Final = 1
 TEAM_FRAMES: Final = 2
 
-#: Number of samples that a reader of hidden states may lag behind.
+#: Maximum number of samples that a reader of hidden states can lag behind.
 TRUTH_BUFFER: Final = 128
 
 
@@ -63,29 +63,29 @@ class RobotResult(NamedTuple):
     reward: float
     #: The robot's marginal reward: how much lower the team's reward would be without it.
     marginal: float
-    #: Number of distinct cells that it visited.
+    #: Number of distinct cells that the robot visited.
     n_visited: int
     #: Number of these cells that were in the state that pays most.
     n_hits: int
-    #: The cell where its path began.
+    #: The cell where the robot's path began.
     start_row: int
     start_col: int
-    #: Its current cell.
+    #: The robot's current cell.
     row: int
     col: int
-    #: The observed cells of its frame: 0 none, 1 the path, 2 every cell.
+    #: The observed cells of the robot's frame: 0 none, 1 the path, 2 every cell.
     coverage: int
     #: Number of moves flown: 0 after a reset, or if the robot hovered or was late.
     n_moves: int
 
     @property
     def start(self) -> tuple[int, int]:
-        """Row and column where its path began."""
+        """Row and column where the robot's path began."""
         return self.start_row, self.start_col
 
     @property
     def cell(self) -> tuple[int, int]:
-        """Its current row and column."""
+        """Current row and column of the robot."""
         return self.row, self.col
 
 
@@ -107,7 +107,7 @@ RESULT_DTYPE: Final = np.dtype([("world", WORLD_DTYPE), ("robot", ROBOT_DTYPE)])
 
 
 class Shape(NamedTuple):
-    """The numbers that determine the layout of answers, from the reply to `hello`."""
+    """The sizes that determine the layout of answers, from the reply to `hello`."""
 
     #: Robots of a world, R.
     n_robots: int

@@ -19,7 +19,7 @@ _Value = TypeVar("_Value")
 
 
 def check_settings(settings: Mapping[str, object]) -> dict[str, Any]:
-    """Checks settings, and returns them with all defaults, by their names in `config/server.toml`.
+    """Checks settings; returns them with all defaults, by their names in `config/server.toml`.
 
     Raises:
         InvalidArgumentError: If a server would refuse them.
@@ -86,7 +86,7 @@ def as_seeds(
 
 
 def as_list(values: Iterable[_Value], subject: str) -> list[_Value]:
-    """Makes a list of an argument with one value for each world."""
+    """Converts an argument with one value for each world to a list."""
     try:
         return list(values)
     except Exception as error:  # any type, as in `as_array`
@@ -123,7 +123,7 @@ def repr_of(value: object) -> str:
 
 
 def as_json(value: object) -> Any:
-    """Converts a keyword to an equivalent JSON value: for `spec.to_json`, which Minari calls."""
+    """Converts a keyword's value to JSON for `spec.to_json`, which Minari calls."""
     if isinstance(value, PathLike):
         return fspath(cast("PathLike[str]", value))
     if isinstance(value, np.generic | np.ndarray):
@@ -170,7 +170,7 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
         raise invalid("action", f"shape ({n_worlds}, {n_moves}){one}", given.shape)
     if given.dtype.kind not in "iu":
         raise invalid("action", "integers", given.dtype)
-    # The shift is 0 for the moves 0 to 3 alone.
+    # Only the moves 0 to 3 are 0 after the shift.
     if (given >> 2).any():
         where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= codes.N_MOVES))[0])
         raise invalid("action", f"moves 0 to {codes.N_MOVES - 1}", f"{given[where]} at {where}")

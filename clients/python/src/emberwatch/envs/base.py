@@ -88,12 +88,12 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         observations.update(ONE_ROW, answer.frames)
 
     def _teams(self, observations: Observations, answer: StepAnswer) -> StepAnswer | None:
-        """Returns the team's results and frame, if other clients fly teammates and it is needed."""
+        """Returns the team's results and frame; None if no observation part needs them."""
         is_needed = self._robot is not None and observations.shows_team
         return self._session.teams(answer) if is_needed else None
 
     def _trace(self, answer: StepAnswer, path: NDArray[np.uint8]) -> None:
-        """Stores the flown cells of a path for pictures."""
+        """Stores the cells of a flown path for pictures."""
         robot = answer.result().robot
         self._path = fly(robot.start, path[: robot.n_moves], self._spec)
 

@@ -55,29 +55,30 @@ class WildfireMovesEnv(WorldEnv):
 
     1. The probability of the state that pays most.
     2. The entropy of the belief divided by log S. Channels 1 and 2 are 0 in the cells that this
-       path has visited, or in the cells that it has seen if the model pays seen cells.
+       path has visited, or has seen if the model pays for seen cells.
     3. 1 in the cells that this path has visited.
     4. 1 off the grid and in no-fly cells.
     5. The share of the path's moves that remain, the same in all cells.
 
     `recent` needs no model. It has one channel for each of the O observed values. The channel of a
     cell's last observed value is 255 if the last frame observed it, and halves every 16 steps; the
-    cell's other channels are 0. All O are 0 in the cells where channels 1 and 2 of `local` are. The
-    last three channels are channels 3 to 5 of `local`.
+    cell's other channels are 0. In cells that this path has visited (or seen, as in `local`), all O
+    channels are 0. The last three channels are channels 3 to 5 of `local`.
 
     ## Rewards
 
-    With `reward="share"` (the default), `"team"` or `"marginal"`, the last move of a path has the
-    path's reward, and the moves before have 0. Cells pay by their state after the world moved, so
-    the reward is known only after the flight. The three differ in worlds of several robots, as for
-    `WildfireEnv`.
+    With `reward="share"` (the default), `"team"` or `"marginal"`, the last move of a path gets the
+    path's reward, and all other moves get 0. Cells pay by their state after the world has moved, so
+    the reward is known only after the flight. The three differ only in worlds of several robots, as
+    in `WildfireEnv`.
 
     With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
-    the world moves. (If the model pays seen cells, a cell pays when it is first seen.) The last
-    move also has the difference to the robot's share of the path's true reward. This is small for a
-    lone robot, as one step changes few cells. Both kinds of reward sum to the same over each path.
-    But `"move"` reveals more about the hidden state, and earlier, so results with the two are not
-    comparable. It needs the hidden states: with `instance`, the server must publish them.
+    the world moves. (If the model pays for seen cells, a cell pays when it is first seen.) The last
+    move's reward also corrects the sum to the robot's share of the path's true reward, so `"move"`
+    and `"share"` have the same sum over each path. The correction is small for a lone robot, as one
+    step changes few cells. But `"move"` reveals more about the hidden state, and earlier, so
+    results with the two are not comparable. It needs the hidden states: with `instance`, the server
+    must publish them.
 
     ## Episode End
 
@@ -198,7 +199,7 @@ class WildfireMovesEnv(WorldEnv):
         info["action_mask"] = self._flights.masks[0]
         if self.render_mode == "human":
             self._draw()
-        # Copies: each move of a path returns the frame again.
+        # Copied, because each move of a path returns the same frame.
         cells = self._flights.robots
         return self._observations.one(answer.frames.copy(), cells, self._seen_teams), info
 
@@ -219,7 +220,7 @@ class WildfireMovesEnv(WorldEnv):
 class WildfireMovesVectorEnv(WorldVectorEnv):
     """Many robots of `WildfireMovesEnv`, stepped together.
 
-    One message flies the paths of all robots that complete one. Takes the arguments of
+    One message flies the paths of all robots that complete a path. Takes the arguments of
     `WildfireMovesEnv`, and `num_envs`, `max_episode_steps` (in moves) and `autoreset_mode` of
     `WildfireVectorEnv`.
     """
@@ -289,7 +290,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         return self._flights.robots
 
     def _shown(self) -> NDArray[np.uint8]:
-        return self._frames.copy()  # each move of a path returns the frames again
+        return self._frames.copy()  # each move of a path returns the same frames
 
     def _path(self, row: int) -> NDArray[np.intp] | None:
         if not self._flights.n_made[row]:

@@ -29,13 +29,13 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     `Discrete(8)`, one action for each of the `objectives`: the probability of the state that pays
     most; the same plus the entropy of the belief, with two different weights; the entropy alone;
-    cells that were not observed for long; the probability along three paths together; the region of
-    the highest probability; the region that was not observed for longest.
+    cells that have long been unobserved; the probability along three paths together; the region of
+    the highest probability; the region that has been unobserved for longest.
 
     ## Observation Space
 
     `Box(-inf, inf, (8, 26), float32)`: row i describes the path that action i flies.
-    `feature_names` names the 26 numbers, and docs/environments/objective.md explains them. One
+    `feature_names` names the 26 features, and docs/environments/objective.md explains them. One
     network can score each row separately. `gymnasium.wrappers.FlattenObservation` makes a vector.
 
     ## Starting State
@@ -52,9 +52,9 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     As in `WildfireEnv` without `observation`, `reward` and `robot`, for worlds of one robot. Also:
 
-    * `estimator`: the kind of belief. The default is the kind that `checkpoint` holds, or
-      `"known_model"` without a checkpoint. If fires are rare, learned ones find several times as
-      many.
+    * `estimator`: the kind of belief. The default is the kind that `checkpoint` contains, or
+      `"known_model"` without a checkpoint. If fires are rare, learned estimators find several times
+      as many.
         * `"known_model"`: the Bayes filter with the true model
         * `"spatial_filter"`: known, where observations also correct neighbouring cells
         * `"second_order_filter"`: known, with a second-order mean of the ratio in eq. 3
@@ -69,9 +69,9 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; it
       takes a second the first time), `"initial"` or `"uniform"`.
 
-    With `instance`, this process keeps the beliefs and plans, too. It publishes its beliefs like
-    `emberwatch-agent`, and `close` leaves them to the next client. If the server hides its model,
-    pass `model` or `checkpoint`.
+    With `instance`, this process keeps the beliefs and plans, too. It publishes its beliefs as
+    `emberwatch-agent` does, and `close` leaves them to the next client. If the server hides its
+    model, pass `model` or `checkpoint`.
 
     ## Vectorized environment
 

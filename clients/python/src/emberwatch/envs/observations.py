@@ -90,7 +90,7 @@ class Observations:
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
 
     def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Resets the rows `begun`, whose episodes have begun, or were resumed with a frame.
+        """Resets the rows `begun`, whose episodes have just begun or have been resumed.
 
         `frames` has a frame for every row, shape (n_rows, H, W).
         """

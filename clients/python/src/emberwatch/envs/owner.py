@@ -74,7 +74,7 @@ class SessionOwner:
 
     @property
     def turn(self) -> AbstractContextManager[object]:
-        """A lock that lets one thread at a time step or reset; use it in a `with`."""
+        """A lock for `with` statements, which lets one thread at a time step or reset."""
         return self._session.turn
 
     def allow_test_worlds(self) -> None:
@@ -82,7 +82,7 @@ class SessionOwner:
         self._session.allows_test_worlds = True
 
     def __getstate__(self) -> dict[str, Any]:
-        """Supports copies of closed environments only: no two may act on the same worlds."""
+        """Refuses copies of open environments, as no two environments may act on one world."""
         return state_of(self, self.is_open, "gymnasium.make(env.spec)")
 
 

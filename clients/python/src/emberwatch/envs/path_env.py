@@ -26,7 +26,7 @@ class WildfireEnv(WorldEnv):
     A hidden Markov model spreads a fire over a grid of H x W cells. Each cell is normal, latent or
     on fire. In each step the robot flies a path of T moves. Then the whole world moves once, and
     the robot observes the cells that it visited. Observations have errors: a latent cell mostly
-    looks normal. The robot must decide where to fly from what it has observed before. The model is
+    looks normal. The robot must choose its paths from its earlier observations. The model is
     the one of Yoon et al., *Estimation and Planning of Exploration Over Grid Map Using A
     Spatiotemporal Model with Incomplete State Observations*, equations 2 to 4. Any other model
     file works, too.
@@ -51,7 +51,7 @@ class WildfireEnv(WorldEnv):
     | `frame` | `Box(0, 255, (H, W, 1), uint8)` | observed value of each cell; 255: not observed |
     | `image` | `Box(0, 255, (H, W, O + 1), uint8)` | `frame` one-hot, 255 in the value's channel |
     | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
-    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was observed; 255: never, or >= 255 |
+    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since last observed; 255: never, or >= 255 |
     | `belief` | `Box(0, 255, (H, W, S), uint8)` | 255 times each state's probability |
     | `team` | `Box(0, 255, (H, W, 1), uint8)` | `frame` of all robots of the world together |
     | `others` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells of the other robots |
@@ -60,17 +60,17 @@ class WildfireEnv(WorldEnv):
     the model file, the robot also observes cells up to r rows and columns away from its path. O is
     the number of the model's observations times the number of the sensor's observation matrices.
     `belief` is the known model's Bayes filter (paper equations 5 and 6): the distribution of the
-    state that the next path meets, given all frames so far. Its prior is the default of
+    state that the next path will observe, given all frames so far. Its prior is the default of
     `wrappers.BeliefObservation`.
 
     ## Rewards
 
-    The number of distinct visited cells that burn after the world moved. In general, the sum of the
-    model's rewards over these cells, or over the seen cells if the model file's sensor pays them.
-    The start cell counts only if the path returns to it. In a world of several robots, `reward`
-    chooses between `"share"` (the default: a cell that v robots visited pays each of them 1 / v),
-    `"team"` (the reward of all robots together), and `"marginal"` (how much lower the team's reward
-    would be without this robot).
+    The number of distinct visited cells that burn after the world has moved. In general, the sum of
+    the model's rewards over the distinct visited cells, or over the seen cells if the model pays
+    for them. The start cell counts only if the path returns to it. In a world of several robots,
+    `reward` chooses between `"share"` (the default: a cell that v robots visited pays each of them
+    1 / v), `"team"` (the reward of all robots together), and `"marginal"` (how much lower the
+    team's reward would be without this robot).
 
     ## One Robot of a Team
 
@@ -93,7 +93,8 @@ class WildfireEnv(WorldEnv):
     ## Episode End
 
     Never `terminated`. `truncated` after `max_episode_steps` (default 1,000; pass another number to
-    `gymnasium.make`), or after the steps of the task or the running server's `--max-steps`.
+    `gymnasium.make`), or after the number of steps that the task or the running server's
+    `--max-steps` sets.
 
     ## Information
 
@@ -123,7 +124,7 @@ class WildfireEnv(WorldEnv):
     * `height`, `width` (64), `n_moves` (64; the T above), `burn_in` (10,000), `sensor_radius`
       (None: the model's), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): for worlds
       in this process. With `instance`, leave them out or repeat the server's values.
-    * `states`: recorded states instead of a model: the name of built-in ones, a `.npz` or `.npy`
+    * `states`: recorded states instead of a model: the name of built-in states, a `.npz` or `.npy`
       file, or a folder (see `docs/recorded-worlds.md`). They determine `height`, `width` and
       `burn_in`, and the last recorded step truncates the episode.
     * `states_symmetries` (False), `states_offset` (0): how episodes are made of recorded states.

@@ -69,10 +69,10 @@ class Plans:
         self.action_space: Final = spaces.Discrete(len(OBJECTIVES))
         shape = len(OBJECTIVES), len(FEATURES)
         self.space: Final = spaces.Box(-np.inf, np.inf, shape, np.float32)
-        #: Name of the estimator that keeps the beliefs.
+        #: Name of the estimator that computes the beliefs.
         self.estimator: Final = self._made().estimator
         self._native: _native.Options | None = None
-        #: Instance and number of world 0 under which beliefs are published; None: they are not.
+        #: Instance and number of world 0 for published beliefs; None: beliefs are not published.
         self._watched: tuple[str, int] | None = None
         #: Features of all worlds' plans; a new array after each step.
         self.features = np.zeros((session.n_worlds, *shape), np.float32)
@@ -208,5 +208,5 @@ class PlansOwner:
 
     @property
     def estimator(self) -> str:
-        """Name of the estimator that keeps the belief."""
+        """Name of the estimator that computes the belief."""
         return self._plans.estimator

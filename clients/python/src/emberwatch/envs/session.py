@@ -1,6 +1,6 @@
 """Sessions: the robots behind an environment, in worlds of this process or of a running server.
 
-A session opens nothing before the first reset. So an environment may be made in one process and
+A session opens nothing before the first reset. So an environment can be made in one process and
 used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 """
 
@@ -37,8 +37,8 @@ from emberwatch.errors import (
 )
 from emberwatch.model.tasks import Task
 
-# Seconds since its last use after which a lease on a running server expires. Long, as learners may
-# pause between steps; the server notices a dead holder at once anyway.
+# Seconds without use after which a lease on a running server expires. Long, as learners may pause
+# between steps. The server notices a dead holder at once anyway.
 _LEASE: Final = 3600.0
 
 #: Errors after which the session does not hold its worlds, or does not know their step.
@@ -106,7 +106,7 @@ class Session:
         self.allows_test_worlds = False
         # Worlds can move without this session's path only if other clients fly in them.
         self._accepts_late = settings.robot is not None
-        #: Number of unobserved world steps before the last answer, because a path came too late.
+        #: Number of world steps that the last answer skipped, because a path came too late.
         self.n_skipped = 0
         if settings.instance is None:
             self.spec, self._robots = own_spec(settings, n_rows)
@@ -130,7 +130,7 @@ class Session:
 
     @property
     def turn(self) -> threading.RLock:
-        """A lock that lets one thread at a time step or reset; use it in a `with`."""
+        """A lock for `with` statements, which lets one thread at a time step or reset."""
         if self._made_after != _n_forks:
             with _fork_lock:
                 if self._made_after != _n_forks:
@@ -395,7 +395,7 @@ class Session:
 
     def _warn_of_task(self, task: Task) -> None:
         tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
-        # Attributed to this line, wherever the reset is: so Python shows it once in a process.
+        # Attributed to this line, not to the caller, so that Python shows it once per process.
         warnings.warn(
             f"task {task.name!r}: an episode begins on a test world (seeds {tests.start} to "
             f"{tests.stop - 1}); train on seeds from {others} on, with reset(seed={others}) or a "
@@ -456,7 +456,7 @@ class Session:
         return self._opened().observe(timeout=self.settings.timeout)
 
     def _check_unchanged(self, client: Client) -> None:
-        """Refuses a server whose worlds differ: the instance may have a new server."""
+        """Refuses a new server of the instance if its worlds differ from the first server's."""
         spec, _ = running_spec(self.settings, self._asked_rows, client.info)
         if spec != self.spec:
             raise invalid(

@@ -24,7 +24,7 @@ from emberwatch.model.tasks import Task, built_in_tasks
 #: Upper bound of drawn seeds, which every JSON reader represents exactly (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
 
-#: Keywords whose name differs from their setting in `config/server.toml`, by the setting.
+#: Maps settings of `config/server.toml` to keywords whose names differ.
 _KEYWORDS: Final = {
     "moves": "n_moves",
     "worlds": "num_envs",
@@ -87,7 +87,8 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
-    #: Whether infos and pictures show the hidden states. `truth` may be set for rewards alone.
+    #: Whether infos and pictures show the hidden states. If not, `truth` may still be set, for
+    #: rewards that need them.
     reveals: bool = False
 
     def __post_init__(self) -> None:
@@ -114,7 +115,7 @@ class Settings:
 
     @classmethod
     def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
-        """Makes settings of an environment's shared keywords.
+        """Makes settings from an environment's shared keywords.
 
         Raises:
             TypeError: If a keyword is unknown. The message names the most similar keyword, and all
@@ -167,7 +168,7 @@ class Settings:
 
 
 def shows_keywords(init: _Init) -> _Init:
-    """Replaces ``**world`` in a signature by the keywords and defaults, for `help` and editors."""
+    """Replaces ``**world`` in a signature with keywords and defaults, for `help` and editors."""
     plain: Any = init
     own = signature(plain).parameters.values()
     kinds = get_type_hints(Settings)

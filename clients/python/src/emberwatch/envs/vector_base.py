@@ -100,7 +100,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
-        #: Whether learners get copies of the frames, whose changes do not affect `seen`.
+        #: Whether learners receive copies of the frames, so that `seen` keeps the originals.
         self.keeps_frames = False
 
     def reset(
@@ -113,7 +113,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
         Args:
             seed: The seed s of the first world; world i gets s + i. Or a sequence with one seed for
-                each row, in which the first row of a world counts. None: each world's generator
+                each row; a world takes the seed of its first row. None: each world's generator
                 draws its next seed.
             options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
                 robots of a world; or `resume`, see `WildfireEnv`.
@@ -224,7 +224,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         raise NotImplementedError
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
-        """Called after episodes in the rows `begun` have begun or were resumed."""
+        """Called after episodes in the rows `begun` have begun or have been resumed."""
 
     def _robots(self) -> NDArray[np.int64]:
         """Returns row and column of each robot as a new array."""

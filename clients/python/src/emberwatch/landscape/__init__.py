@@ -3,11 +3,11 @@
 Reading needs ``pip install emberwatch[landscape]``. `inputs` finds the files. `raster` (with
 rasterio), `netcdf` (with netCDF4; `axes` and `packing` apply the CF conventions) and `numpy_file`
 read them as `layers`. `schedule` computes the time of each layer, `ground` the size of cells on the
-ground (with pyproj). `lengths` has units, `grid` checks positions and resamples. `fire` makes
-states of times, masks or codes, `world` writes the files for `emberwatch-server --states`,
+ground (with pyproj). `lengths` defines units, `grid` checks positions and resamples. `fire`
+converts times, masks or codes to states, `world` writes the files for `emberwatch-server --states`,
 `picture` draws them, and `__main__` parses the flags.
 
 `python -m emberwatch.landscape land` makes model files with zones. `elevation` computes slopes,
-`terrain` finds zones and has the formula of slope and wind, `compass` parses directions, `zoned`
-makes the kernels of each zone, and `land` parses the flags.
+`terrain` groups cells into zones and implements the formula for slope and wind, `compass` parses
+directions, `zoned` makes the kernels of each zone, and `land` parses the flags.
 """

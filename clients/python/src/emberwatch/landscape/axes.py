@@ -49,7 +49,7 @@ class Line(NamedTuple):
     cell: float
     """The size of a cell; 0 if unknown."""
     is_falling: bool
-    """Whether coordinates fall along the axis."""
+    """Whether coordinates decrease along the axis."""
     unit: str
     """`m`, `degrees`, or empty if unknown."""
 
@@ -105,7 +105,7 @@ def auxiliary(variable: Any) -> Iterator[Any]:
 
 
 def find(group: Any, name: str) -> Any | None:
-    """Returns the variable of a name in a group or in the groups around it."""
+    """Finds a variable by name in a group or its enclosing groups; None if there is none."""
     while group is not None:
         try:
             found = group[name]

@@ -23,7 +23,7 @@ def bearing(text: str) -> float | None:
 
 
 def facing(eighths: int) -> str:
-    """Returns the aspect of a slope: the point that it faces, downhill.
+    """Returns the aspect of a slope: the compass point that it faces, downhill.
 
     `eighths`: the direction in which the slope rises, in eighths of a circle from the east towards
     the north.

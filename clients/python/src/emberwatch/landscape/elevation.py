@@ -43,7 +43,7 @@ def slopes(layer: Layer, *, cell: Side | None, height_unit: str | None, oblong: 
 
 
 def _sides(layer: Layer, cell: Side | None, *, oblong: bool) -> tuple[tuple[float, float], str]:
-    """Returns width and height of a cell in metres, and the source of these numbers."""
+    """Returns width and height of a cell in metres, and a note on the source of these lengths."""
     place, name = layer.place, layer.name
     if min(place.shape) < 2:
         got = f"{place.shape[0]} x {place.shape[1]}"

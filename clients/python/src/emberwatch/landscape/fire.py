@@ -24,7 +24,7 @@ UNBURNT, BURNING, BURNT = 0, 1, 2
 
 Kind = Literal["arrival", "mask", "burning", "states"]
 
-#: Parts of words that name each state, in the order in which they are searched.
+#: Parts of words that name each state, in search order.
 _WORDS: Final = (("not_burn", "unburn"), ("burning",), ("burned", "burnt"))
 MOST_STATES: Final = 1 << 31  # maximum size of a sequence, bytes
 
@@ -56,11 +56,11 @@ class Meaning:
     unit: str | None = None
     """Unit of arrival times, or of the times of layers; None: the file's."""
     begin: float | None = None
-    """The arrival time of step 0; earlier arrivals count as this one. None: the earliest."""
+    """The arrival time of step 0, which replaces earlier times. None: the earliest."""
     burning: int = 1
     """Number of steps that a cell burns after its arrival."""
     every: int = 1
-    """A step is made of every `every`-th layer without a time."""
+    """If layers have no times, every `every`-th layer becomes a step."""
     crop: tuple[int, ...] | None = None
     """Top, left, height and width of the used part of each layer; None: the whole layer."""
     codes: tuple[float, float, float] = (UNBURNT, BURNING, BURNT)
@@ -273,7 +273,7 @@ def _checked(
 
 
 def _at(layers: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Converts numbers of layers to steps; infinite ones stay infinite."""
+    """Converts layer numbers to step numbers; infinite numbers stay infinite."""
     numbers = np.where(np.isfinite(layers), layers, len(steps)).astype(np.intp)
     return np.append(steps, np.inf)[numbers]
 

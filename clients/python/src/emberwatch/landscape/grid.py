@@ -32,7 +32,7 @@ class Place:
     projection: str | None = None
     """Coordinate reference system as well-known text."""
     metres: float | None = None
-    """Length of a unit of x and y without a projection, metres; None if unknown."""
+    """Length of a unit of x and y in metres, if there is no projection; None if unknown."""
 
     def ground(self, down: float = 0.5, right: float = 0.5) -> Ground | None:
         """Returns a cell's size on the ground; None if it is unknown.

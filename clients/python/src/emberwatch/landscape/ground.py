@@ -67,7 +67,7 @@ def unit_of(projection: str) -> tuple[float, bool] | None:
 
 
 def vertical_unit(projection: str) -> tuple[float, str] | None:
-    """Returns the length of a unit of height in metres, and its name; None without heights."""
+    """Returns the length in metres and the name of the unit of height; None without heights."""
     crs = _parsed(projection)
     for axis in () if crs is None else crs.axis_info:
         if axis.direction == "up":

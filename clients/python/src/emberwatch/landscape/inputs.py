@@ -1,4 +1,4 @@
-"""The files of each sequence, and the reader of each format. Holds one layer in memory."""
+"""Finds the files of each sequence, and reads them. Only one layer is in memory at a time."""
 
 import os
 import re
@@ -26,8 +26,8 @@ _AUXILIARY: Final = (".prj", ".tfw", ".xml")
 def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
     """Returns the files of each sequence.
 
-    Each folder is a sequence, ordered by the numbers in its file names. All files given by name are
-    one more sequence. `one_file_each` makes each file a separate sequence.
+    Each folder is a sequence, ordered by the numbers in its file names. All files given by name
+    together are one more sequence. `one_file_each` makes each file a separate sequence.
     """
     found, loose = list[list[Path]](), list[Path]()
     for path in inputs:

@@ -1,4 +1,4 @@
-"""Layers: numbers with the positions of their cells; and helpers of the readers of all formats."""
+"""Layers, which are values with the positions of their cells, and helpers for all readers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -63,7 +63,7 @@ def choose_bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
 
 
 def is_missing(stored: NDArray[Any], nodata: Sequence[float]) -> NDArray[np.bool_]:
-    """Returns a mask of the cells that hold one of the `nodata` numbers.
+    """Returns a mask of the cells that contain one of the `nodata` numbers.
 
     The numbers are rounded to the type of the file's numbers first.
     """

@@ -1,4 +1,4 @@
-"""Imports of the libraries of the extra `landscape`, when they are needed."""
+"""Imports the libraries of the extra `landscape` when they are needed."""
 
 import importlib
 from typing import Any

@@ -153,7 +153,7 @@ def _check_straight(file: Path, variable: Any, axes: dict[str, Axis]) -> None:
 
 
 def _mapping(variable: Any, column: str) -> Attributes:
-    """Returns the attributes of the grid mapping: the only one, or the columns' grid mapping."""
+    """Returns the attributes of the grid mapping; of the columns' one if there are several."""
     words = str(attributes(variable).get("grid_mapping", "")).split()
     name = named = ""
     for word in words:
@@ -168,7 +168,7 @@ def _mapping(variable: Any, column: str) -> Attributes:
 def _projection(file: Path, mapping: Attributes, *, is_in_degrees: bool) -> str | None:
     """Returns the projection as well-known text.
 
-    A grid mapping that pyproj does not know becomes a text of its attributes, only to be compared.
+    A grid mapping that pyproj does not know becomes a list of its attributes, for comparisons only.
     """
     pyproj = library("pyproj", file)
     text = mapping.get("crs_wkt") or mapping.get("spatial_ref")

@@ -53,7 +53,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
 
 
 def _place(file: Path, source: Any) -> Place:
-    """Returns the grid of a file. The identity as transform means that it has no position."""
+    """Returns the grid of a file. If the transform is the identity, the file has no position."""
     check_cells(file, source.height, source.width)
     (height, width), transform, crs = source.shape, source.transform, source.crs
     if transform.is_identity:
@@ -100,7 +100,7 @@ def _ascii(file: Path, shape: tuple[int, int], nodata: Sequence[float]) -> NDArr
         raise invalid(file, wanted, values.size)
     with contextlib.suppress(ValueError):
         nodata = (*nodata, float(never))
-    with np.errstate(over="ignore"):  # compared as 32 bits, as the header may round its number
+    with np.errstate(over="ignore"):  # compared as 32-bit numbers: the header may be rounded
         values[is_missing(values.astype(np.float32), nodata)] = np.nan
     return values.reshape(shape)
 

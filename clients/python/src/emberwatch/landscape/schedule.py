@@ -31,7 +31,7 @@ _DATE: Final = re.compile(
 
 
 class Clock(NamedTuple):
-    """The unit and origin of times, in the words of the file."""
+    """The unit and origin of times, as the file writes them."""
 
     words: str = ""
     calendar: str = "standard"

@@ -64,7 +64,7 @@ def quoted(text: str) -> str:
 
 
 def check_outputs(out: Path, picture: Path | None, *, force: bool) -> None:
-    """Refuses names with other endings, and without `force` files that exist already."""
+    """Refuses names with wrong endings, and without `force` files that exist already."""
     if out.suffix != ".npz":
         raise invalid("--out", "a .npz file", out)
     if picture is not None and picture.suffix != ".png":

@@ -71,7 +71,7 @@ def toml(model: Mapping[str, Any]) -> str:
 
 
 def _spreads(entry: Table, state: str) -> bool:
-    """Returns whether an entry makes cells of other states change to `state` by its neighbours."""
+    """Returns whether an entry makes neighbours in `state` change cells in other states to it."""
     weights = entry.get("scale", 1.0) * np.array(entry["weights"], float)
     weights[weights.shape[0] // 2, weights.shape[1] // 2] = 0.0
     return entry["from"] == entry["to"] == state != entry.get("own") and bool(weights.any())
@@ -85,7 +85,7 @@ def _even(weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _to_first_state(base: Table) -> list[Table]:
-    """Returns kernels that move a cell to the first state, whatever its neighbours are."""
+    """Returns kernels that change a cell to the first state, whatever its neighbours' states."""
     names = [state["name"] for state in base["states"]]
     height, width = base["kernel_size"]
     weights = np.zeros((height, width))

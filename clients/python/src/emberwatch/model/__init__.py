@@ -46,8 +46,8 @@ class Description:
     """``O[state, observed value]``, shape (S, O). The columns are `n_rings` matrices side by side;
     each row of each matrix is a distribution."""
     reward: NDArray[np.float64]
-    """Reward by the state of a cell, shape (S,). A step pays it once for each distinct cell that
-    `pays` names."""
+    """Reward of a cell in each state, shape (S,). A step pays it once for each distinct cell that
+    the robot visited or saw, as `pays` specifies."""
     airspace: Airspace
     """Where robots may fly and what they see."""
     toml: str
@@ -135,8 +135,9 @@ class Model(Description):
     kernels: NDArray[np.float64]
     """The weights ``w[next state, state of the neighbour, row, col]`` of eq. 2. The centre is the
     cell itself; rows grow downward. A model has one kernel for all cells, shape (1, S, S, KH, KW),
-    or one for each state of the cell itself, shape (S, S, S, KH, KW). With zones, each zone has its
-    own, zone after zone: shape (n_zones, S, S, KH, KW) or (n_zones * S, S, S, KH, KW)."""
+    or one for each state of the cell itself, shape (S, S, S, KH, KW). With zones, each
+    zone has its own kernels, zone by zone: shape (n_zones, S, S, KH, KW) or
+    (n_zones * S, S, S, KH, KW)."""
     bias: NDArray[np.float64]
     """``b`` of eq. 2, which is added to each next state's weight, shape (S,)."""
     initial: NDArray[np.float64]
@@ -169,7 +170,7 @@ class Model(Description):
 
     @classmethod
     def checked(cls, name: str | PathLike[str]) -> Self:
-        """Like `named`, for a name or file that has been checked already."""
+        """Returns the same model as `named`, for a name or file that has already been checked."""
         text = _native.built_in("models").get(fspath(name))
         if text is not None:
             return cls.from_toml(text)
@@ -181,7 +182,7 @@ class Model(Description):
 
     @classmethod
     def wildfire(cls) -> Self:
-        """Returns the built-in model of the paper's section II, the model `wildfire`."""
+        """Returns the built-in model `wildfire`, from section II of the paper."""
         return cls.checked("wildfire")
 
     @property

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emberwatch.model.airspace import Airspace
 
-#: Row and column that each move adds: up, down, left, right.
+#: Change in row and column of each move: up, down, left, right.
 DIRECTIONS: Final = np.array(((-1, 0), (1, 0), (0, -1), (0, 1)), np.int64)
 
 

@@ -136,7 +136,7 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
 
 
 def ansi(picture: Picture, *, color: bool = True) -> str:
-    """Draws the same for a terminal, hidden states on the right, without a final line break.
+    """Draws the picture as text for a terminal, hidden states on the right; no final line break.
 
     With colour (24 bits), a cell is two characters. On grids of more than 32 rows it is half a
     character, and the path is a tint. Without colour, a cell is two ASCII characters. The first is

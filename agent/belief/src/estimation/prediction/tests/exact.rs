@@ -14,7 +14,8 @@ struct Exact {
     joint: Vec<f64>,
 }
 
-/// Returns the state of a cell in a joint state, whose number has one ternary digit per cell, cell 0 the lowest.
+/// Returns the state of a cell in a joint state. The index of a joint state has one ternary digit per cell, with cell 0
+/// as the lowest digit.
 fn state(joint: usize, cell: usize) -> usize {
     joint / 3_usize.pow(cell as u32) % 3
 }
@@ -74,7 +75,7 @@ impl Exact {
         self.joint.iter_mut().for_each(|p| *p /= total);
     }
 
-    /// Returns the divergence of a belief from the exact one, summed over cells.
+    /// Returns the Kullback-Leibler divergence of a belief from the exact belief, summed over cells.
     fn divergence_of(&self, belief: &Belief) -> f64 {
         let mut sum = 0.0;
         for cell in 0..self.shape.n_cells() {
@@ -93,7 +94,7 @@ impl Exact {
         sum
     }
 
-    /// Draws the joint state that follows `joint`.
+    /// Draws the next joint state after `joint`.
     fn draw(&self, joint: usize, random: &mut impl FnMut() -> f64) -> usize {
         let cells = self.next[joint].iter().rev();
         cells.fold(0, |to, cell| {

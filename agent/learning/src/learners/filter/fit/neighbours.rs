@@ -8,7 +8,7 @@ use emberwatch_model::Frame;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Weight of earlier sums after each frame of any world. They fade, because earlier parameters were worse.
+/// Decay factor of the sums per frame of any world. Old sums fade, because they result from worse parameters.
 const KEPT: f64 = 1.0 - 1.0 / 4000.0;
 
 /// Learns the correlations of the state with the highest reward.
@@ -22,7 +22,7 @@ pub struct Neighbours {
 }
 
 impl Neighbours {
-    /// Returns the learned correlations of a state, or the defaults if another state was learned.
+    /// Returns the learned correlations of a state, or default values if another state's correlations were learned.
     pub fn correlations_of(&self, state: usize) -> Correlations {
         if self.state == Some(state) {
             self.correlations.clone()
@@ -41,7 +41,7 @@ impl Neighbours {
         self.ages.clear();
     }
 
-    /// Adds a robot's next frame. `predictor` is the belief before it, unless it is the first frame.
+    /// Adds a robot's next frame. `predictor` is the belief before the frame, or `None` for the first frame.
     pub fn see(
         &mut self,
         robot: u32,

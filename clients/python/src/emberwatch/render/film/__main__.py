@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _NAME = "python -m emberwatch.render.film"
 _PAUSE_MILLIS = 1000  # minimum duration of the last picture and of pictures of gaps
-_MOST_PIXELS = 1 << 30  # maximum of all pictures together, which Pillow holds in memory
+_MOST_PIXELS = 1 << 30  # maximum sum over all pictures, which Pillow keeps in memory
 _MOST_SIMULATED = 100_000  # maximum burn-in of a first belief; longer ones do not change it
 _MOST_NAMED = 6  # maximum number of runs of steps in an error
 

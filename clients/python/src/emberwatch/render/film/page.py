@@ -41,7 +41,7 @@ class _Panel:
     palette: Palette
     marks: list[tuple[_Mark, str]]
     cells: Callable[[Scene], NDArray[np.uint8] | None]
-    """Returns the numbers of the cells' colours; None if a scene has no data for the panel."""
+    """Returns each cell's index in the palette; None if a scene has no data for the panel."""
     has_path: bool = False
 
 

@@ -1,4 +1,4 @@
-"""Scenes of a recording: the known model's filter follows the records, also over missing steps."""
+"""Scenes of a recording, with a filter that also predicts through missing steps."""
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -41,7 +41,7 @@ def steps(records: Iterable[Record]) -> Iterator[Step]:
     """Yields the steps of the records of one world. A frame that was published again counts once.
 
     Warns:
-        UserWarning: If worlds of another kind follow, from another server; they are left out.
+        UserWarning: If worlds of another kind follow, from another server. They are left out.
     """
     server: ServerInfo | None = None
     last: tuple[int, int] | None = None
