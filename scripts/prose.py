@@ -18,9 +18,9 @@ from proselint.tools import LintFile
 
 #: Phrases to avoid, and what to write instead. Phrases are regular expressions; a space matches any white space.
 PHRASES = {
-    "name the thing": r"\b(those|that) (of|who|which) (a|an|the|which)\b|\bof which\b|\bof such\b|\bsuch a one\b",
-    "use a noun instead of a clause": r"\bwhat [a-z]+ (has|have|needs?|gives?|knows?)\b|\bas one of\b",
-    "write maximum, minimum, number of or capacity": r"\bso many\b|\broom for\b|[^t] most [a-z-]+ (of an?|per)\b",
+    "name the thing": r"\bsuch a one\b|\bthose (who|that) (are|is)\b|\bwhat [a-z]+ (is|are|was|were) of\b",
+    "use a noun instead of a clause": r"\bwhat (it|an? [a-z]+) (has|have|gives?|knows?)\b|\bas one of\b",
+    "write maximum, minimum, number of or capacity": r"\bso many\b|\broom for\b|[.:] Most [a-z-]+ (of an?|per)\b",
     "write reports, receives or knows": r"\b(is|are|was|were|be) told\b|\btells? of\b",
     "write updates with, records or resumes": r"\b(take[sn]?|taking|took) in\b|\b(go|goes|going|gone|went) on\b",
     "write next to, besides or together with": r"\bbeside\b",

@@ -33,7 +33,7 @@ fn a_killed_agents_world_is_free_and_unchanged() {
     let mut frames = frames_until(&observer, 0, 0);
     for _ in 0..3 {
         let next = Wire::open(&server.instance);
-        // An observer's buffer has room for this many steps, so none is lost if it reads late.
+        // An observer's buffer holds this many steps, so none is lost if it reads late.
         let agent = start_agent(&server.instance, "--steps 50");
         let at = frames[frames.len() - 1].header.result.step;
         frames.extend(frames_until(&observer, 0, at + 4));

@@ -60,7 +60,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
         second.check_says("the frames that the server keeps");
         // The third agent attaches after a release and finds the second agent's belief.
         let third = run(&server, &format!("{policy} --steps 20")).ends(0);
-        third.check_says("the belief that was left");
+        third.check_says("the belief was taken over from the former agent");
         assert!(!third.stderr.contains(FIRST_BELIEF), "{}", third.stderr);
         let last = server.step_of(0);
         assert_eq!(

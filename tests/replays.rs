@@ -76,7 +76,7 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
             status, message, ..
         }) => {
             assert_eq!(status, Status::NotPermitted);
-            assert!(message.contains("a recording is replayed"), "{message}");
+            assert!(message.contains("replays a recording"), "{message}");
         }
         other => panic!("expected a refusal, got {other:?}"),
     }

@@ -68,7 +68,7 @@ fn a_neural_belief_corrects_a_filter_and_decisions_learn_on_it() {
     place.refuse(
         "other",
         &wrong,
-        "--checkpoint | what learned_filter acts on",
+        "--checkpoint | for the estimator learned_filter",
     );
 
     let flags = format!("{WORLDS} --learner decisions --estimator neural_belief");

@@ -125,7 +125,7 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
         (
             "new",
             &format!("{WORLDS} --learner neural --coverage full"),
-            "--coverage applies only with --learner filter, got neural",
+            "--coverage applies only with --learner filter, got --learner neural",
         ),
     ] {
         place.refuse(out, flags, words);

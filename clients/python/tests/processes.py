@@ -70,7 +70,7 @@ class Program:
         return re.sub(r"(?m)^\S+Z +[A-Z]+ ", "", self._output.read().decode()).strip()
 
     def ended(self) -> str:
-        """Waits until the program ends by itself. Returns what it has printed."""
+        """Waits until the program ends by itself. Returns its output."""
         self.process.wait(PATIENCE)
         return self.output()
 
