@@ -139,7 +139,7 @@ class Programs:
 
 
 def flags(settings: dict[str, object]) -> list[str]:
-    """Returns settings as command-line flags, without those that are None."""
+    """Returns the settings that are not None as command-line flags."""
     given = {name: value for name, value in settings.items() if value is not None}
     pairs = [(f"--{name.replace('_', '-')}", value) for name, value in given.items()]
     return [name if value is True else f"{name}={value}" for name, value in pairs]

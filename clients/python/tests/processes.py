@@ -35,7 +35,7 @@ SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
 #: Where iceoryx2 keeps the files of nodes and services.
 CHANNELS = Path(f"/dev/shm/emberwatch-{os.getuid()}")
 
-#: Closes what a test has opened, in reverse order; `conftest.py` calls it.
+#: Closes the resources of a test, last opened first; `conftest.py` calls it.
 at_the_end = ExitStack()
 
 
