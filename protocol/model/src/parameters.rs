@@ -1,8 +1,8 @@
 //! The parameters of the hidden Markov model on a grid, for simulators and filters.
 //!
-//! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation matrix `O` of eq.
-//! 1. [`super::file`] is the file format. [`super::transition`] applies the parameters to beliefs, and
-//! [`super::dynamics`] applies them to states.
+//! Paper section II: states with the transition kernel `w` and bias `b` (eq. 2), and the observation matrix `O` (eq. 1).
+//! [`super::file`] is the file format. [`super::transition`] applies the parameters to beliefs, and [`super::dynamics`]
+//! applies them to states.
 
 use super::airspace::Airspace;
 use super::built_in::MODELS;

@@ -136,8 +136,8 @@ class Model(Description):
     """The weights ``w[next state, state of the neighbour, row, col]`` of eq. 2. The centre is the
     cell itself; rows grow downward. A model has one kernel for all cells, shape (1, S, S, KH, KW),
     or one for each state of the cell itself, shape (S, S, S, KH, KW). With zones, each
-    zone has its own kernels, zone by zone: shape (n_zones, S, S, KH, KW) or
-    (n_zones * S, S, S, KH, KW)."""
+    zone has its own kernels, stored one zone after another: shape (n_zones, S, S, KH, KW), or
+    (n_zones * S, S, S, KH, KW) with one for each state of the cell itself."""
     bias: NDArray[np.float64]
     """``b`` of eq. 2, which is added to each next state's weight, shape (S,)."""
     initial: NDArray[np.float64]
