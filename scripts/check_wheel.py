@@ -1,4 +1,4 @@
-"""Tries a new user's first steps with the installed package. `scripts/wheel` removes compilers from PATH.
+"""Tries a new user's first steps with the installed package. `scripts/wheel` runs it with a PATH without compilers.
 
 Runs the example of docs/environments/wildfire.md, which needs Pillow.
 """
@@ -35,7 +35,7 @@ def output(*command: str) -> str:
 
 
 def check_place() -> None:
-    """Checks that PATH has no compiler, and that the imported package is the installed one."""
+    """Checks that PATH contains no compiler, and that the imported package is the installed one."""
     for name in ("cargo", "rustc", "cc", "gcc", "clang"):
         assert shutil.which(name) is None, f"{name} is on the PATH"
     assert Path(emberwatch.__file__).is_relative_to(sys.prefix), emberwatch.__file__

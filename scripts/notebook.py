@@ -1,7 +1,7 @@
 """Runs a notebook's code cell by cell. `notebook.py FILE` compares the outputs with those stored in the file.
 
-The code must print the same text except for numbers, and draw pictures of the same size. `--write` stores the new
-outputs in the file. The package and Pillow must be installed.
+The new outputs must have the same text, except for numbers, and pictures of the same size. With `--write`, they
+replace the stored outputs instead. The package and Pillow must be installed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def data_of(value: Any) -> dict[str, Any]:
 
 
 def words(outputs: list[dict[str, Any]]) -> str:
-    """Returns the part of the outputs that is compared: texts without numbers, and sizes of pictures."""
+    """Returns the parts of the outputs that are compared: texts without their numbers, and the sizes of pictures."""
     texts = list[str]()
     for output in outputs:
         data = output.get("data", {})
@@ -58,7 +58,7 @@ def words(outputs: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Runs all cells in one namespace."""
+    """Runs all cells in one namespace, then compares or stores their outputs."""
     path, names = Path(sys.argv[1]), dict[str, Any]()
     notebook = json.loads(path.read_text("utf-8"))
     for cell in notebook["cells"]:

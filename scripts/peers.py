@@ -1,7 +1,7 @@
-"""Measures the peers with which `scripts/bench` compares Emberwatch, in the same run.
+"""Measures the alternatives with which `scripts/bench` compares Emberwatch in the same run.
 
-- Gymnasium's AsyncVectorEnv with shared memory, around a trivial environment with the same spaces (4 KiB of
-  observation, 64 integers of action). This measures the cost of the process boundary.
+- Gymnasium's AsyncVectorEnv with shared memory. Its environments do nothing but have the same spaces as Emberwatch's
+  (observations of 4 KiB, actions of 64 integers), so this measures the cost of the process boundary.
 - The wildfire model's transition, the known-model filter and the shooting planner, written in plain numpy.
 
 Prints medians with minimum and maximum over rounds. Needs gymnasium and numpy.
@@ -55,7 +55,7 @@ def async_vector_env(n_envs, n_steps):
 
 
 def wildfire_kernel():
-    """Returns w[to, from, row, col], as in config/models/wildfire.toml."""
+    """Returns the kernel weights w[to, from, row, col] of config/models/wildfire.toml."""
     around = np.full((3, 3), 0.1)
     around[1, 1] = 1.0
     drift = around * np.array([[1.2], [1.0], [0.8]])

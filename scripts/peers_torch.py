@@ -1,12 +1,12 @@
-"""Measures PyTorch on the same CPU, as the peer of `agent/network/benches/network.rs` in the same run.
+"""Measures PyTorch on the same CPU and in the same run, to compare it with `agent/network/benches/network.rs`.
 
-Measures three networks with torch's layers: the dynamic autoencoder of `agent/network/src/autoencoder.rs` (hidden size
-16, windows of 1,000 frames of 64 x 64 cells), a DQN, and the neural belief's network (updates on 16 grids). Uses two
-threads; single inputs and the neural belief are also measured with one thread. Everything is measured twice: with
+Measures three networks built from torch's layers: the dynamic autoencoder of `agent/network/src/autoencoder.rs` (hidden
+size 16, windows of 1,000 frames of 64 x 64 cells), a DQN, and the neural belief's network (updates on 16 grids). Uses
+two threads; single inputs and the neural belief are also measured with one thread. Everything is measured twice: with
 glibc's default allocator, and with an allocator that keeps its memory and uses huge pages.
 
 Prints medians with minimum and maximum over rounds, and the mean processor time, which is more reliable on a busy
-machine. Needs torch. Arguments select the measurements: a name must contain one of the arguments.
+machine. Needs torch. If arguments are given, runs only the measurements whose name contains one of them.
 """
 
 import os
@@ -25,7 +25,7 @@ N_VISITED = 33
 N_THREADS = 2
 DQN_INPUTS, DQN_ACTIONS, DQN_BATCH, DQN_REPLAY = 16, 4, 64, 1000
 
-# glibc reads these settings only at start, so each setting runs in its own process.
+# glibc reads these variables only at start, so the measurements run in one process for each of the two settings.
 AS_IS = {}
 TUNED = {
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
@@ -72,7 +72,7 @@ class UNet(nn.Module):
 
 
 class Autoencoder(nn.Module):
-    """Maps frames to predictors of the next frames: encoder, recurrence, decoder, observation matrix."""
+    """Maps frames to predictors of the next frames: an encoder, a recurrence, a decoder and an observation matrix."""
 
     def __init__(self):
         super().__init__()
@@ -114,7 +114,7 @@ def frames(share):
 def autoencoder_update(share):
     network, (seen, visited) = Autoencoder(), frames(share)
     optimiser = torch.optim.Adam(network.parameters(), 1e-3, betas=(0.5, 0.9))
-    # Computes the loss only in visited cells, as careful torch code would.
+    # Computes the loss only in visited cells, as optimised torch code would.
     step, row, col = visited[1:].nonzero(as_tuple=True)
     goal = seen[1:][step, :, row, col]
 

@@ -2,7 +2,7 @@
 
 The package and Pillow must be installed.
 
-For Wildfire, this is the picture that the example on its page draws.
+The picture for Wildfire is the one that the example on its page draws.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def wildfire() -> None:
 
 
 def moves() -> None:
-    """Draws the last path, and a part of the next path."""
+    """Draws a robot's last path, and a part of its next path."""
     parts = ("belief", "robot")
     env = gymnasium.make("emberwatch/WildfireMoves-v0", observation=parts, **SMALL, **SHOWN)
     seen, _ = env.reset(seed=1000)
@@ -67,7 +67,7 @@ def objective() -> None:
 
 
 def team() -> None:
-    """Draws four robots. Each robot plans on its own belief."""
+    """Draws four robots. Each robot plans with its own belief."""
     env = emberwatch.parallel_env(
         robots=4, action="path", observation=("belief", "robot"), start="random", **SMALL, **SHOWN
     )

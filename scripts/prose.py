@@ -16,7 +16,7 @@ from proselint.registry import CheckRegistry
 from proselint.registry.checks import Check, types
 from proselint.tools import LintFile
 
-#: Phrases to avoid, and what to write instead. Phrases are regular expressions; a space matches any white space.
+#: Advice, and the phrases to avoid as a regular expression, in which a space matches any white space.
 PHRASES = {
     "name the thing": r"\bsuch a one\b|\bthose (who|that) (are|is)\b|\bwhat [a-z]+ (is|are|was|were) of\b",
     "use a noun instead of a clause": r"\bwhat (it|an? [a-z]+) (has|have|gives?|knows?)\b|\bas one of\b",
@@ -27,7 +27,8 @@ PHRASES = {
     "write instead of": r"\bin the place of\b",
     "say what applies instead": r"\bexpected none\b",
 }
-#: Disabled checks of proselint: matters of taste, lists of simple words, and repeated words, which headings can have.
+#: Disabled checks of proselint, which concern matters of taste, lists of simple words, or repeated words (a heading may
+#: repeat words).
 OFF = ("typography", "hyperbole", "weasel_words", "restricted", "lexical_illusions", "dates_times")
 OURS = [
     Check(
@@ -96,7 +97,7 @@ def faults(path: Path) -> Iterator[str]:
     """Yields one line for each fault in a file."""
     text = TEXT_OF[path.suffix](path.read_text("utf-8"))
     file = LintFile(str(path), text)
-    # Comments are fragments with code between them, in which many standard checks report false positives.
+    # In comments, only the project's own list is checked, because many standard checks report false positives there.
     checks = ALL_CHECKS if path.suffix == ".md" else OUR_CHECKS
     for fault in file.lint({**DEFAULT, "checks": checks}):
         found = " ".join(file.content[slice(*fault.check_result.span)].split())

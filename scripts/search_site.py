@@ -13,7 +13,7 @@ from pathlib import Path
 
 from playwright.sync_api import Page, TimeoutError, sync_playwright
 
-#: A page to search from, the search words, and a page that the search must find.
+#: Searches: the page on which to search, the search words, and a page that must be found.
 SEARCHES = (
     ("index.html", "attaching and swapping", "attaching.html"),
     ("environments/wildfire.html", "autoreset", "environments/moves.html"),
@@ -26,7 +26,7 @@ def finds(page: Page, words: str, expected: str) -> bool:
     box = page.get_by_role("textbox", name="Search")
     link = page.locator(f".md-search-result__link[href*='{expected}']").first
     box.click()
-    # The page ignores input until it has loaded its index.
+    # Types the words again and again, because the page ignores input until it has loaded its index.
     for _ in range(15):
         box.fill("")
         box.press_sequentially(words, delay=50)

@@ -1,7 +1,7 @@
 """Writes the pages of the documentation site to a folder: `site.py FOLDER`.
 
-The pages are `docs` and the repository's other documents, so that nothing is written twice. Links are rewritten for the
-site, and a notebook becomes a page.
+The pages are made from `docs` and the repository's other documents, so that no text exists twice. Links are rewritten
+for the site, and a notebook becomes a page.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: Documents outside `docs`, with the pages that they become.
+#: Files outside `docs`, and their paths on the site.
 OUTSIDE = {
     "README.md": "index.md",
     "ARCHITECTURE.md": "architecture.md",
@@ -30,7 +30,7 @@ OUTSIDE = {
     "config/landscapes/jacksboro/README.md": "jacksboro.md",
 }
 
-#: An index for readers of the repository. The site has a navigation instead.
+#: An index for readers of the repository, which the site does not need because it has a navigation.
 LEFT_OUT = {"docs/README.md"}
 
 #: A paragraph of the first page that addresses only readers of the repository.
@@ -43,11 +43,11 @@ HOME = "---\nhide: [navigation]\n---\n\n"
 API = "\n\n---\n\nAPI: [Python]({0}reference.md), [Rust]({0}rust.md)\n"
 
 FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
-#: The opening of a code fence: its language, and further words that only tests use.
+#: The opening of a code block: its language, and further words that only tests use.
 INFO = re.compile(r"\A(```\w+)[^\n]*")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?![a-z]+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 NAMED = re.compile(r"(?<!\[)`([\w./-]+\.md)`")
-#: The space before a number's error or interval, where lines must not break.
+#: A number's error or confidence interval with the spaces in it, where lines must not break.
 SPREAD = re.compile(r"(?<=\d)( ± (?=\d)| \[-?[\d.]+, -?[\d.]+\])")
 
 
@@ -73,7 +73,7 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
         n_pictures += bool(mark)
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
         if path in found:
-            # All pictures except the first are loaded when they scroll into view.
+            # All pictures except the first are loaded only when they scroll into view.
             later = "{loading=lazy}" if mark and n_pictures > 1 else ""
             shown = f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''}){later}"
             # A click opens a picture at full size, because its text is small on a phone.

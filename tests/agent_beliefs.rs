@@ -1,4 +1,4 @@
-//! The beliefs that agents publish to readers of their channel.
+//! Tests of the beliefs that agents publish on their channel.
 
 use crate::trainings::on;
 use emberwatch_protocol::agent_belief::AgentBelief;
@@ -18,7 +18,7 @@ fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief
     Some(shown)
 }
 
-/// Reads until a belief about each of these worlds has arrived.
+/// Reads the channel until a belief about each of these worlds has arrived.
 fn until_all(observer: &Observer<AgentHeader>, worlds: std::ops::Range<u32>) -> Vec<AgentBelief> {
     let (mut all, start) = (Vec::<AgentBelief>::new(), Instant::now());
     let mut missing: BTreeSet<u32> = worlds.collect();
@@ -62,7 +62,8 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
         .last()
         .expect("an observer from before the agent connects to it");
     assert_eq!(last.header.step, 500);
-    // The posterior is nearly certain of cells on the last path: a fire is observed as fire with probability 0.98.
+    // The posterior is nearly certain for cells on the last path, because a fire is observed as fire with probability
+    // 0.98.
     let surest = last.belief.iter().copied().fold(0.0, f32::max);
     assert!(surest > 0.9, "{surest}");
 }

@@ -116,7 +116,8 @@ fn a_checkpoint_keeps_hidden_vectors_goes_on_and_is_acted_on() {
         "expected a network for the world's grid, 7 x 9 | got one for 6 x 9",
     );
 
-    // Resuming with another world starts a new episode, and drops rows that are newer than the checkpoint or cut short.
+    // Resuming with another world starts a new episode. It also drops rows that are newer than the checkpoint or cut
+    // short.
     let metrics = place.folder.text("out/metrics.csv");
     let last = metrics
         .lines()
@@ -148,7 +149,7 @@ fn episodes_that_end_are_begun_again() {
     let rows = place.learn("out", &format!("{} --steps 30", on(&server)));
     assert!(!rows[29][LOSS].is_empty() && !rows[29][DQN_LOSS].is_empty());
     assert_eq!(server.step_of(0), 30 % 7);
-    // If an agent stops at the end of an episode, the world needs a reset before its next step.
+    // Flies to the end of the episode: the resumed agent must then reset the world before its next step.
     let mut client = server.acquire(0..1);
     for _ in 30 % 7..7 {
         fly(&mut client, vec![Move::Up; 5]);
@@ -156,7 +157,7 @@ fn episodes_that_end_are_begun_again() {
     client.release().expect("released");
     place.learn("out", &format!("{} --steps 3 --resume", on(&server)));
     assert_eq!(server.step_of(0), 3);
-    // A window of frames may cover a whole episode.
+    // Here a window of frames covers a whole episode.
     let server = Server::start(&format!("{WORLD} --coverage client --max-steps 3"));
     let rows = place.learn("whole", &format!("{} --steps 9", on(&server)));
     assert!(!rows[8][LOSS].is_empty());

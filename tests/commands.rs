@@ -4,7 +4,7 @@ use emberwatch_learning::policy;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, Ended, Folder, Program, SERVER, SMALL, Server, new_instance, run};
 
-/// Flags of a very short comparison on its own worlds.
+/// Flags of a very short comparison that starts its own server.
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
                     --policies coverage --baseline coverage";
 
@@ -103,7 +103,9 @@ pub fn agent(arguments: &str) -> Ended {
     ended
 }
 
-/// Checks every line `flags => words | words` of a table, after replacing `TINY` by [`TINY`].
+/// words | words` of a table, after replacing `TINY` by [`TINY`]. => Checks every line `flags => words | words` of a
+/// table, in which the word `TINY` stands for the flags in [`TINY`]. => words | words` of a table, after replacing
+/// `TINY` by [`TINY`].
 pub fn check_table(program: &str, table: &str) {
     for line in table.trim().lines() {
         let (flags, words) = line.split_once(" => ").expect("flags and words");

@@ -1,4 +1,5 @@
-//! End-to-end tests of `emberwatch-agent compare`: comparisons repeat bit for bit, also with a second model.
+//! End-to-end tests of `emberwatch-agent compare`: repeated comparisons are equal bit for bit, also with a second
+//! model.
 
 use crate::commands::{TINY, agent, check};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
@@ -9,10 +10,10 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 use tests::harness::{AGENT, Folder, Program, Server, repository};
 
-/// The flags of a comparison, without the worlds.
+/// The flags of a comparison, except those for its worlds.
 const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-width 4";
 
-/// The worlds, as flags of the agent's private server.
+/// Flags for the worlds, which the agent's private server simulates.
 const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 
 /// Worlds with many fires.
@@ -182,13 +183,14 @@ fn a_second_model_runs_from_end_to_end() {
     assert_eq!(server.step_of(0), 40);
     let figures = Folder::default();
     let rows = compare(&format!("{flags} --figures {}", figures.word("figures")));
-    // Sixteen policies: the default comparison has one policy for each of the three states without a reward.
+    // The default comparison has sixteen policies here, because it has one policy for each of the three states without
+    // a reward.
     assert_eq!(rows.len(), 16 * 2, "{rows:?}");
     assert!(figures.path("figures/snapshot.svg").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
     let flags = format!("--steps 3 --beam-width 5 {model}");
     Program::agent(&hidden.instance, &flags).ends(0);
-    // All of the model's states persist: in 160 samples, the rarest state never covered less than 1 % of 960 cells.
+    // Every state of the model persists. In 160 samples, the rarest state never covered less than 1 % of the 960 cells.
     let model = Model::from_toml(include_str!("../config/models/road-ice.toml")).expect("a model");
     let dynamics = Dynamics::new(&model, Shape::new(24, 40).expect("a shape"));
     let source = Source::Simulated(dynamics.expect("it fits"));

@@ -39,7 +39,7 @@ impl Client {
     }
 }
 
-/// Generates a test for each fact and client.
+/// Generates one test for each pair of a fact and a client.
 macro_rules! suite {
     ($($fact:ident),* $(,)?) => {
         mod rust {
@@ -256,7 +256,8 @@ fn a_damaged_or_outdated_step_changes_nothing(client: Client) {
     steps.check_body(second, &one, Incomplete, 0);
     let both = step_body(&[1, 0], &[0; 18]);
     steps.check_body(|h| h.n_robots = 3, &both, Incomplete, 3);
-    // All robots that the client holds, in several worlds. In one of these worlds, another client holds a robot.
+    // A request for all robots that the client holds. It is refused, because another client holds a robot in one of
+    // these worlds.
     let all = step_body(&[1, 0, 0], &[0; 30]);
     steps.check_body(|h| h.n_robots = 5, &all, Incomplete, 5);
     for (k, status) in [(0, Late), (2, Early), (u64::MAX, Early)] {
@@ -266,8 +267,8 @@ fn a_damaged_or_outdated_step_changes_nothing(client: Client) {
     steps.check_body(|h| h.n_robots = 4, &second, Early, 0);
 }
 
-/// Requests that are refused, each with the status, the detail and words of the refusal. `OURS`, `THEIRS` and `ENDED`
-/// stand for leases, `US` and `THEM` for processes.
+/// Requests that are refused. Each is followed by the status, the detail and words of the refusal. `OURS`, `THEIRS` and
+/// `ENDED` stand for leases, `US` and `THEM` for processes.
 const REFUSED: &str = r#"
  => Malformed 0 malformed control message
 { => Malformed 0 malformed control message
@@ -374,7 +375,8 @@ fn a_step_answer_echoes_its_request_and_fits_its_payload(client: Client) {
 fn a_client_that_shuts_the_server_down_is_answered(client: Client) {
     let server = Server::start(SMALL);
     let wire = client.open(&server.instance);
-    // The memory for answers disappears with the server. This request makes the client map it before the server ends.
+    // The shared memory for answers disappears when the server ends. This request makes the client map the memory
+    // before that.
     wire.ask(&Request::Status {});
     assert_eq!(wire.ask(&Request::Shutdown {}), Reply::Done);
     server.program.ends(0);

@@ -1,4 +1,4 @@
-//! Tests of agents that are killed or stopped in the middle of a step. Their world must not change.
+//! Tests of agents that are killed or stopped in the middle of a step, which must not change their world.
 
 use emberwatch_protocol::channels::{ChannelError, Instance};
 use emberwatch_protocol::client::Claim;
@@ -17,10 +17,10 @@ use tests::wire::{
     RawClient, Wire, acquire_request, answer, control_header, step_body, step_header,
 };
 
-/// A grid on which planning takes most of a step.
+/// A grid on which planning takes most of the time of a step.
 const FLAGS: &str = "--height 12 --width 9 --moves 8 --burn-in 50";
 
-/// Starts an agent that acts until it is stopped, with tens of milliseconds per step.
+/// Starts an agent that needs tens of milliseconds per step and acts until it is stopped.
 fn start_agent(instance: &Instance, flags: &str) -> Program {
     let slow = "--policy coverage --shooting-samples 100000";
     Program::agent(instance, &format!("{slow} {flags}"))
@@ -33,7 +33,8 @@ fn a_killed_agents_world_is_free_and_unchanged() {
     let mut frames = frames_until(&observer, 0, 0);
     for _ in 0..3 {
         let next = Wire::open(&server.instance);
-        // An observer's buffer holds this many steps, so none is lost if it reads late.
+        // The agent flies only as many steps as an observer's buffer holds, so that none is lost if the observer reads
+        // late.
         let agent = start_agent(&server.instance, "--steps 50");
         let at = frames[frames.len() - 1].header.result.step;
         frames.extend(frames_until(&observer, 0, at + 4));
@@ -86,7 +87,7 @@ fn a_stopped_agent_loses_its_lease_and_says_so_when_it_wakes() {
     let mut next = Client::acquire(server.connect(), &long).expect("acquire");
     let before = next.observe(0..1).expect("observe");
     agent.signal(Signal::CONT);
-    // The lease went to this test, or expired if the agent had been paused for long before.
+    // The agent has lost its lease, which expired during the pause. This test now holds the robot.
     agent.ends(3).check_says("lease lost");
     let after = next.observe(0..1).expect("observe");
     assert_eq!(after, before, "it stepped nothing");
@@ -129,7 +130,7 @@ fn an_abandoned_step_is_made_at_most_once() {
     );
     drop(pending);
     server.program.signal(Signal::CONT);
-    // Only one of the two paths for k = 0 is flown.
+    // Two paths for k = 0 are sent, of which only one may be flown.
     for k in 0..8 {
         let (reply, _) = wire.step(step(2 + k), &step_body(&[k], &[1; 8]));
         assert_eq!(reply.sequence, 2 + k);

@@ -14,7 +14,7 @@ use std::ops::Range;
 use tests::fuzz::{TARGETS, Target};
 use tests::meter::memory;
 
-/// Maximum length of a damaged file, in bytes. Every file of the corpus is shorter.
+/// Maximum length of a damaged file, in bytes. Every undamaged file of the corpus is shorter.
 const MAX_BYTES: usize = 1 << 15;
 
 /// Maximum processor time for one input, in seconds.
@@ -23,7 +23,7 @@ const MAX_SECONDS: i64 = 1;
 /// Maximum growth of the process's peak memory over all inputs of a decoder, in KiB.
 const MAX_GROWTH: u64 = 64 << 10;
 
-/// Integers at the limits of lengths, counts and signs. Each is also tried plus one and plus two.
+/// Integers at the limits of lengths, counts and signs. For each integer n, the tests also use n + 1 and n + 2.
 #[rustfmt::skip]
 const INTEGERS: [u64; 9] =
     [0, 7, 0x7f, 0xff, 0x7fff, 0xffff, 0x7fff_ffff, 0xffff_ffff, u64::MAX >> 1];
@@ -32,12 +32,12 @@ const INTEGERS: [u64; 9] =
 const WORDS: &str = r#"0 1 -1 -0.0 255 65536 4294967296 9007199254740993 9223372036854775807 18446744073709551615 1e400
     1e-400 1e308 1e100 1e30 1e-30 1e-320 nan -inf inf null true " \u0000 \ud800 """ { } [ ] [[ = , é"#;
 
-/// A change to a file. Its position is taken modulo the number of positions in the file.
+/// A change to a file. Its position is any integer, taken modulo the number of positions in the file.
 #[derive(Debug, Clone)]
 enum Change {
     /// Replaces a range of bytes with other bytes.
     Splice(usize, usize, Vec<u8>),
-    /// Writes an integer of 1, 2, 4 or 8 bytes at a multiple of its length.
+    /// Writes an integer of 1, 2, 4 or 8 bytes at an offset that is a multiple of its length.
     Overwrite(usize, Vec<u8>),
     /// Replaces the next number in a text.
     Number(usize, Vec<u8>),
@@ -83,7 +83,7 @@ fn apply(change: &Change, bytes: &mut Vec<u8>) {
     bytes.truncate(MAX_BYTES);
 }
 
-/// Returns the first run of digits and points after a position.
+/// Returns the range of the first run of digits and points after a position.
 fn number_after(bytes: &[u8], at: usize) -> Range<usize> {
     let is_number = |byte: &u8| byte.is_ascii_digit() || *byte == b'.';
     let begin = bytes[at..].iter().position(is_number);
@@ -104,7 +104,7 @@ fn decode(target: &Target, bytes: &[u8]) -> Result<bool, TestCaseError> {
 fn attack(target: &Target) {
     let name = target.name;
     let files = target.corpus().expect(name);
-    // Resets the peak. Where that is not allowed, the old peak remains, which is at least as large.
+    // Resets the peak of the memory. If that is not allowed, the old peak, which is at least as large, remains.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     let before = memory("VmHWM:", std::process::id());
     for file in &files {

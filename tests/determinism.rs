@@ -18,7 +18,7 @@ const SMALL: &str = "--height 9 --width 14 --burn-in 200";
 /// A grid so large that several threads step a batch of 8 worlds.
 const LARGE: &str = "--height 128 --width 128 --burn-in 3";
 
-/// The observations of a world, step by step.
+/// The observations of a world at each step.
 type Trajectory = Vec<Observation>;
 
 fn start(flags: &str) -> Server {
@@ -34,7 +34,7 @@ fn without_episode(mut observation: Observation) -> Observation {
     observation
 }
 
-/// Runs one world after the other on a server with one world, one thread, one client and no observers.
+/// Simulates the worlds one after the other, on a server with one world, one thread, one client and no observers.
 fn reference(size: &str) -> Vec<Trajectory> {
     let server = start(&format!("{size} --worlds 1 --threads 1"));
     let mut client = server.acquire(0..1);
@@ -103,7 +103,7 @@ fn worlds_do_not_notice_who_acts_on_them_or_where_robots_fly() {
     assert!(stale.is_err(), "a lost lease steps nothing");
     batches(&mut third, 8..N_STEPS, &mut trajectories);
     assert!(trajectories == reference(SMALL));
-    // Full frames show all states with their observation noise.
+    // Full frames contain a noisy observation of every state.
     let flags = format!("{SMALL} --coverage full");
     let servers = [start(&flags), start(&format!("{flags} --start random"))];
     let mut clients = servers.each_ref().map(|server| server.acquire(0..1));

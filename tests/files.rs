@@ -7,7 +7,7 @@ use tests::harness::{AGENT, Folder, SERVER, SMALL, Server, repository, run};
 #[test]
 fn wrong_files_are_refused_by_path_and_entry() {
     let folder = Folder::default();
-    // The kernel has weight only on the cell above, which cells of the top row lack.
+    // The kernel's only weight is on the cell above, and cells in the top row have no cell above.
     let above = r##"
         name = "from-above"
         kernel_size = [3, 1]

@@ -1,4 +1,5 @@
-//! Tests of the channels `frames` and `truth`: their content and receivers. The server must never wait for observers.
+//! Tests of the channels `frames` and `truth`: what they contain, and who receives it. The server must never wait for
+//! observers.
 
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use emberwatch_protocol::message::{FrameHeader, VERSION};
@@ -64,7 +65,8 @@ fn a_late_observer_gets_the_current_frame_of_every_world_at_once() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let paths = vec![Paths::new(0).next(6); 3];
     server.acquire(0..3).step(0..3, &paths).expect("step");
-    // The second and third observers connect right after another has left, so that the number of observers stays one.
+    // The second and third observer connect right after the previous one has left, so the server may see one observer
+    // all the time.
     for _ in 0..3 {
         let observer = observe(&server);
         for world in 0..3 {
@@ -154,7 +156,7 @@ fn hidden_states_come_on_request_and_agree_with_what_is_told() {
             n_cells += 1;
         }
     }
-    // Binomial: 0.98 +- 6 standard errors of at most sqrt(0.98 * 0.02 / n).
+    // The share is binomial, so it must lie within 6 standard errors, sqrt(0.98 * 0.02 / n), of 0.98.
     let share = f64::from(n_right) / f64::from(n_cells);
     let bound = 6.0 * (0.98 * 0.02 / f64::from(n_cells)).sqrt();
     assert!((share - 0.98).abs() < bound, "{share} of {n_cells}");

@@ -17,7 +17,7 @@ const FLAGS: &str =
 /// A history long enough for all frames of these tests.
 const ALL: &str = "--history 100000";
 
-/// The line that an agent logs if it must simulate its first belief.
+/// The line that an agent logs if it must compute its first belief by simulation.
 const FIRST_BELIEF: &str = "simulating the first belief";
 
 fn run(server: &Server, flags: &str) -> Program {
@@ -29,14 +29,15 @@ fn ask(robot: u32) -> Request {
     Request::Belief { robot, offset: 0 }
 }
 
-/// Returns the paths flown up to step `last`, as far back as an observer's buffer reaches: more than 40 steps.
+/// Returns the paths flown up to step `last`, starting with the oldest step in the observer's buffer, which holds more
+/// than 40 steps.
 fn paths(observer: &Observer<FrameHeader>, last: u64) -> Vec<Vec<Move>> {
     let samples = frames_until(observer, 0, last);
     let flown = samples.iter().filter(|it| it.header.result.step > 0);
     flown.map(path_of).collect()
 }
 
-/// Returns the paths of an agent that nobody takes over from.
+/// Returns the paths of an agent that acts without a handover.
 fn undisturbed(n_steps: u64, policy: &str) -> Vec<Vec<Move>> {
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
@@ -58,7 +59,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
         let second = second.ends(0);
         second.check_says(FIRST_BELIEF);
         second.check_says("the frames that the server keeps");
-        // The third agent attaches after a release and finds the second agent's belief.
+        // The third agent starts after the second one has released its robot, and finds the second agent's belief.
         let third = run(&server, &format!("{policy} --steps 20")).ends(0);
         third.check_says("the belief was taken over from the former agent");
         assert!(!third.stderr.contains(FIRST_BELIEF), "{}", third.stderr);
@@ -172,7 +173,7 @@ fn a_left_belief_goes_whole_to_its_robot_and_step_only() {
             "{robot} {step} {offset} {length} {data}"
         );
     }
-    // A partial belief is not returned, and a refused part changes nothing.
+    // An incomplete belief is not returned, and a part that is refused changes nothing.
     assert_eq!(leave(1, 0, 0, 2, "AA=="), Reply::Done);
     assert_eq!(wire.ask(&ask(1)).status(), Status::NotKept);
     assert_eq!(leave(1, 0, 0, 1, "AAAA").status(), Status::Malformed);
@@ -193,7 +194,8 @@ fn an_agent_told_to_stop_leaves_its_belief() {
     let Ok(Reply::Belief { info, .. }) = belief else {
         panic!("expected a belief, got {belief:?}");
     };
-    // Each cell has three probabilities and the time of its last observation. Two rewards and a count follow.
+    // The belief contains three probabilities and the time of the last observation for each cell, then two rewards and
+    // a count.
     assert_eq!(info.length, (3 + 1) * 16 * 16 * 4 + 16);
     assert!(info.kind.starts_with("bayes_filter "), "{}", info.kind);
 }

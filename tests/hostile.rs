@@ -103,7 +103,7 @@ fn requests_whose_answers_nobody_reads_disturb_nobody() {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
         for round in 0..1_000 {
-            // Only the first path may be flown; all later paths are late.
+            // All these paths are for step 0, so only the first may be flown and all later ones are late.
             let step = wire.send_step(second_robot(lease), &body(0)).expect("send");
             let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
             let refused = wire.send_step(second_robot(lease), &body(0));
@@ -167,7 +167,7 @@ fn held_samples_limit_only_their_holder() {
         let lease = wire.acquire(1..2).lease;
         let mut held = Vec::new();
         for _ in 0..200 {
-            // A client that holds too many samples cannot send, or receives no answer.
+            // A client that keeps too many answers can no longer send, or receives no answer.
             let Ok(pending) = wire.send_step(second_robot(lease), &body(held.len() as u64)) else {
                 break;
             };
@@ -193,7 +193,7 @@ fn old_leases_and_numbers_open_nothing_again() {
         for k in 0..10 {
             let lease = wire.acquire(1..3).lease;
             let status = |from: &Wire| from.status_of(second_robot(lease), &body(k)).0;
-            // An identical request is late.
+            // A repeated request is late.
             assert_eq!(status(&wire), Status::Ok);
             assert_eq!(status(&wire), Status::Late);
             assert_eq!(status(&other), Status::NoLease);
@@ -269,7 +269,7 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
             assert!(server.step_of(1) <= step + 1, "it is stopped");
             agent.signal(Signal::CONT);
         }
-        // The agent is killed while it is stopped.
+        // Stops the agent with a signal, then kills it.
         agent.signal(Signal::STOP);
         drop(agent);
         let is_free = || Client::acquire(server.connect(), &Claim::new(1..2)).is_ok();

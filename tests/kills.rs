@@ -17,13 +17,13 @@ use tests::meter::all_under;
 /// A small server that is ready immediately.
 const FLAGS: &str = "--burn-in 0 --height 8 --width 8 --moves 4";
 
-/// Starts and kills programs. Returns all their instances and process ids. All these processes have ended.
+/// Starts programs and kills them. Returns all their instances and process ids, after all these processes have ended.
 fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, HashSet<u32>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let instances: Vec<Instance> = (0..10).map(|_| new_instance()).collect();
     let began = Instant::now();
     let running = Server::start(FLAGS);
-    // At least the time that a start takes on this machine, so that some programs are killed while they start.
+    // Kills are spread over at least the time that a server takes to start on this machine, so that some hit its start.
     let longest = (began.elapsed().as_micros() as u64).max(60_000);
     let folder = Folder::default();
     let mut killed = HashSet::new();
@@ -102,7 +102,7 @@ fn kill(n_loops: u64, n_kills: usize, n_kinds: u32) {
             killed.extend(pids);
         }
     });
-    // Runs as a separate program, because this command could hang.
+    // Runs this command as a separate program, because it could hang.
     let flags = format!("status --instance {}", new_instance().name());
     run(SERVER, &flags).check_says("no server on");
     for instance in &instances {
@@ -112,7 +112,8 @@ fn kill(n_loops: u64, n_kills: usize, n_kinds: u32) {
     let mut left = all_under(SHARED_MEMORY.as_ref());
     left.retain(|path| is_of(path, &killed));
     left.extend(instances.iter().flat_map(service_files));
-    // A process killed while it created a service leaves an empty file, which names no instance.
+    // A process that is killed while it creates a service leaves an empty file, which does not contain the instance's
+    // name.
     let is_empty = |path: &PathBuf| {
         path.extension() == Some("service".as_ref())
             && path.metadata().is_ok_and(|it| it.len() == 0)

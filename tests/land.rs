@@ -1,5 +1,5 @@
-//! Tests of zones, no-fly cells and a wide sensor on a running server. The expected observations and rewards follow
-//! from only the paths, the hidden states and the reply to `hello`.
+//! Tests of zones, no-fly cells and a wide sensor on a running server. The expected observations and rewards are
+//! derived only from the paths, the hidden states and the reply to `hello`.
 
 use crate::commands::{agent, check};
 use crate::trainings::on;
@@ -64,7 +64,8 @@ fn robots_see_and_earn_what_hello_and_the_hidden_states_say() {
         let mut client = server.acquire(0..2);
         reset(&mut client, 1000);
         let (mut paths, mut total) = (Paths::new(3), 0.0);
-        // For each observation matrix: the number of observed cells, and how many of these were observed correctly.
+        // The number of observed cells, and how many of these were observed correctly, for each of the two observation
+        // matrices.
         let (mut n_seen, mut n_right) = ([0; 2], [0; 2]);
         for _ in 0..200 {
             let starts = client.observe(0..2).expect("observe");

@@ -1,4 +1,5 @@
-//! Tests of leases: each robot has one holder until release, expiry or takeover. None of these changes its world.
+//! Tests of leases: a robot has one holder until its lease is released or expires, or another client takes the robot
+//! over. None of these events changes the robot's world.
 
 use emberwatch_protocol::client::Claim;
 use emberwatch_protocol::connection::ConnectionError;
@@ -41,7 +42,7 @@ fn a_takeover_ends_the_lease_and_keeps_the_world() {
     next.release().expect("release");
     check(former.step(0..1, &path), Status::LeaseLost, us);
     check(former.release(), Status::LeaseLost, us);
-    // The answer to a renewal lists the robots that the lease still includes.
+    // The answer to a renewal lists only the robots that the lease still holds.
     let Reply::Lease(renewed) = wire.ask(&Request::Renew { lease }) else {
         panic!("expected a lease");
     };

@@ -1,4 +1,4 @@
-//! Tests with shared memory and channel directories that are unusable, or removed while programs run.
+//! Tests in which shared memory or the channel directory is unusable, or is removed while programs run.
 //!
 //! These tests run in a separate mount namespace, because all programs share the real directories. Where a process may
 //! not create a namespace, the tests print a note and pass, except in CI, where they fail.

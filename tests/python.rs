@@ -1,5 +1,5 @@
-//! Sends raw messages through `wire_reference.py`, a client that shares no code with the Rust client. It sends the
-//! given bytes and checks the answers itself.
+//! Sends raw messages through `wire_reference.py`, a client that shares no code with the Rust client. The Python client
+//! sends the given bytes and checks the answers itself.
 
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
 use emberwatch_protocol::channels::Instance;

@@ -36,7 +36,7 @@ kernel = [
 ]
 "##;
 
-/// Returns [`STILL`] as a description of recorded states, which has no kernel.
+/// Converts the model [`STILL`] to a description of recorded states, which lacks the kernel.
 fn description() -> String {
     let (states, _) = STILL.split_once("kernel = [").expect("a model");
     let states = states.replace("kernel_size = [1, 1]", "step = \"10 min\"");
@@ -45,7 +45,7 @@ fn description() -> String {
         .replace("initial = 0.3, ", "")
 }
 
-/// A folder with recorded sequences, in which all recorded steps differ.
+/// A folder with recorded sequences, no two of whose recorded steps are equal.
 struct Place {
     folder: Folder,
     sequences: Vec<Array3<u8>>,
@@ -82,7 +82,7 @@ impl Place {
         format!("--states {folder} --moves {N_MOVES} --publish-truth {more}")
     }
 
-    /// Returns a recorded step of the sequence that a seed selects without symmetries.
+    /// Returns one recorded step of the sequence that a seed selects if symmetries are disabled.
     fn states(&self, seed: u64, recorded_step: usize) -> Grid<u8> {
         let sequence = &self.sequences[seed as usize % self.sequences.len()];
         sequence.index_axis(Axis(0), recorded_step).to_owned()
@@ -95,7 +95,8 @@ fn truth_of(server: &Server) -> TruthFeed {
     TruthFeed::open(&server.instance, shape).expect("truth")
 }
 
-/// Flies a whole episode, which ends truncated. Returns the states of the truth channel, which full frames must show.
+/// Flies a whole episode, which must end by truncation. Checks that full frames show the states of the truth channel,
+/// and returns these states.
 fn episode(client: &mut Client, truth: &TruthFeed, seed: u64) -> Vec<Grid<u8>> {
     reset(client, seed);
     let mut shown = truth.states(0..1, &[seed], 0).expect("truth");

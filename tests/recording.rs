@@ -45,7 +45,7 @@ pub fn stop(recorder: Program) -> Ended {
     ended
 }
 
-/// Returns the intact records of a file, and the error after them, if any.
+/// Returns the intact records at the start of a file, and the error that follows them, if any.
 pub fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
     let mut reader = Reader::new(File::open(file).expect("the file")).expect("a recording");
     let mut error = None;
@@ -145,7 +145,7 @@ fn a_killed_recorder_leaves_whole_records() {
     let recorder = start_recorder(&server.instance, &file, "");
     let mut client = server.acquire(0..1);
     fly_on(&mut client, 0, 30);
-    // The recorder writes the frame within about a second, without being asked.
+    // The recorder writes the frame to the file within about a second, even if it is not stopped.
     wait_for_step(&recorder, &file, 30);
     recorder.kill();
     let (records, error) = read(&file);
@@ -273,7 +273,7 @@ fn a_damaged_recording_is_replayed_up_to_the_damage() {
     let good = frames(&records);
     assert!(matches!(error, Some(RecordingError::Damaged { .. })));
     assert!((1..5).contains(&good.len()) && good[..] == samples[..good.len()]);
-    // The first frame belongs to a reset.
+    // The first frame is from a reset and counts as no step.
     let words = format!("good before it: {} steps", good.len() - 1);
     let instance = new_instance();
     let observer = Observer::frames(&instance).expect("observe");

@@ -1,4 +1,4 @@
-//! Tests of replays: what observers receive from a recording and when, and how clients are answered.
+//! Tests of replays: which samples observers receive and when, and which answers clients receive.
 
 use crate::commands::check;
 use crate::recording::{
@@ -66,7 +66,7 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
     let info = connection.info();
     assert_eq!((info.height, info.n_moves, info.pid), (2, 1, replay.pid()));
     let observer = Observer::frames(&instance).expect("observe");
-    // After the last sample, `--loop` starts again with the first.
+    // After the last sample, `--loop` restarts with the first sample.
     let steps = take(&observer, 7)
         .into_iter()
         .map(|it| it.header.result.step);

@@ -1,4 +1,4 @@
-//! Tests of servers that end by a signal or a kill, and of the behaviour of their agents and successors.
+//! Tests of servers that are ended by a signal or killed, and of their agents and of the next server on the instance.
 
 use emberwatch_protocol::channels::{ChannelError, Instance, create_node};
 use emberwatch_protocol::connection::{Connection, ConnectionError};

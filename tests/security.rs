@@ -1,4 +1,4 @@
-//! Tests what another user can do to our instances: nothing but block their names, which is reported.
+//! Tests that another user can do nothing to our instances except block their names, and that this is reported.
 //!
 //! A thread acts as the other user, which requires root. Without root, these tests print a note and pass.
 
@@ -17,10 +17,10 @@ use std::path::{Path, PathBuf};
 use tests::harness::{PATIENCE, SMALL, Server, eventually, frames_until};
 use tests::meter::all_under;
 
-/// User ids that do not exist.
+/// User ids to which no user belongs.
 const USERS: [u32; 3] = [64_001, 64_002, 64_003];
 
-/// Runs `act` as another user without groups. Returns `None` if this process may not change its user.
+/// Runs `act` as another user who is in no other groups. Returns `None` if this process may not change its user.
 fn as_user<T: Send>(user: u32, act: impl FnOnce() -> T + Send) -> Option<T> {
     let become_user = || {
         let (uid, gid) = (Uid::from_raw(user), Gid::from_raw(user));
@@ -99,7 +99,7 @@ fn another_user_cannot_connect_observe_read_or_remove() {
             denied(path, OpenOptions::new().write(true).open(path).map(drop));
         }
         denied(&ours, std::fs::read_dir(&ours).map(drop));
-        // Permission to remove a file depends on its folder. The folder of shared memory has the sticky bit set.
+        // Whether a user may remove a file depends on its folder. The folder of shared memory has the sticky bit set.
         let removed = remove_file(&segments[0]).expect_err("a segment that is ours");
         assert!(matches!(
             removed.kind(),
@@ -162,7 +162,7 @@ fn who_takes_our_place_first_gets_in_the_way_and_is_told_of() {
     clean_up(user);
 }
 
-/// iceoryx2 changes the umask while it binds a listener. Two threads at once could leave it changed.
+/// iceoryx2 changes the umask while it binds a listener. If two threads do this at once, the umask could stay changed.
 #[test]
 fn threads_that_listen_leave_the_umask_as_it_was() {
     let umask = || {
@@ -181,7 +181,7 @@ fn threads_that_listen_leave_the_umask_as_it_was() {
         }
     };
     std::thread::scope(|scope| (0..4).for_each(|_| drop(scope.spawn(listen))));
-    // While another test binds a listener, the umask differs for a moment.
+    // Repeats the check, because the umask differs for a moment while another test binds a listener.
     let is_as_before = || !umask().ends_with("0177");
     assert!(eventually(PATIENCE, is_as_before), "{}", umask());
 }

@@ -20,7 +20,7 @@ use tests::wire::{RawClient, Wire, control_header};
 
 const N_MOVES: usize = 6;
 
-/// Returns the next observations of a client's worlds on random paths.
+/// Flies random paths in a client's worlds and returns the observations.
 fn future(client: &mut Client, seed: u64) -> Vec<Vec<Observation>> {
     let (mut paths, robots) = (Paths::new(seed), client.robots());
     let mut step = || {
@@ -135,7 +135,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     }
 }
 
-/// Flattens the observations of a client with one robot.
+/// Joins the observations of a client with one robot into one list.
 fn shown_of(seen: Vec<Vec<Observation>>) -> Vec<Observation> {
     seen.into_iter().flatten().collect()
 }
@@ -222,12 +222,14 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
             let seen = client.step(0..2, &path(k)).expect("step");
             assert_eq!(seen, expected[k as usize], "step {k}");
         }
-        // Each round writes at least two snapshots: one after 10 steps, another once that is written or 10 steps later.
+        // Each round writes at least two snapshots: the first after 10 steps, and the second at least 10 steps later,
+        // after the first was written.
         let least = folder.path(&format!("{}-{:012}.snapshot", instance.name(), 2 * round));
         server
             .program
             .until(|| files().last().is_some_and(|newest| *newest >= least));
-        // The latest two snapshots, and the round's first one, which survives a power failure.
+        // The folder keeps the latest two snapshots, and the round's first one if it is older, because that one
+        // survives a power failure.
         server.program.until(|| matches!(files().len(), 2 | 3));
         server.kill();
     }
@@ -370,7 +372,7 @@ fn a_world_in_its_burn_in_begins_again_after_a_restart() {
     server.program.until(|| !snapshots_in(&folder).is_empty());
     server.kill();
     drop(pending);
-    // Copies the snapshot, but with the settings of a server with a short burn-in.
+    // Writes the snapshot's worlds to a new snapshot with the settings of a server with a short burn-in.
     let bytes = std::fs::read(&snapshots_in(&folder)[0]).expect("the snapshot");
     let restored = decode(&bytes).and_then(|file| file.restore(&small_spec(ENDLESS)));
     let restored = restored.expect("of that server");

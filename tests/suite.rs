@@ -63,7 +63,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
     let csv = || place.0.text("out/tiny.csv");
     let rows = csv();
     assert_eq!(rows.lines().count(), 1 + 3 * 3, "{rows}");
-    // Existing rows are not run again: their planning times are unchanged.
+    // The policies of existing rows are not run again, so the planning times in these rows are unchanged.
     let more = place.suite("--policies coverage,beam_exploit,learned_beam");
     more.check_prints("| beam_exploit |");
     more.check_says("3 rows of coverage kept");
@@ -129,7 +129,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
 fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
     let place = Place::new();
     place.suite("--policies coverage");
-    // Rows in the form in which Python writes them, for the same worlds.
+    // Builds rows for the same worlds in the form in which the Python package writes them.
     let rows = place.0.text("out/tiny.csv");
     let of_coverage = rows.lines().filter(|row| row.starts_with("coverage"));
     let python: Vec<String> = of_coverage

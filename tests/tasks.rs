@@ -45,7 +45,8 @@ fn hello_status_and_snapshots_name_the_task() {
     let by_hand = Server::start(SMALL_BY_HAND);
     assert_eq!(by_hand.info().task, None);
     assert_eq!(json(&by_hand).get("task"), None);
-    // A snapshot also fits a server that has the same settings from flags.
+    // A snapshot from a server with a task can be restored on a server with the same settings from flags, and the other
+    // way round.
     for (from, to, is_named) in [(&server, &by_hand, true), (&by_hand, &server, false)] {
         let file = folder.word("one.snapshot");
         from.command(&format!("snapshot {file}")).check(0);
@@ -66,7 +67,7 @@ fn an_agent_refuses_a_server_of_another_task() {
     let server = Server::start(&task);
     let flags = format!("--steps 1 --policy coverage {task}");
     Program::agent(&server.instance, &flags).ends(0);
-    // The agent compares the server's actual settings, not the name of its task.
+    // The agent checks the server's actual settings, not the name of its task.
     for (from, to, words) in [
         (
             "burn_in = 3000",

@@ -1,5 +1,6 @@
-//! Tests of several robots in one world, flown by several clients. The same paths lead to the same bytes. A client that
-//! dies, hangs, is replaced or is refused does not affect the paths and observations of other clients.
+//! Tests of several robots in one world, flown by several clients. The same paths give the same answers, byte for byte,
+//! however the robots are divided among clients. A client that dies, hangs, is replaced or is refused does not affect
+//! the paths and observations of other clients.
 
 use crate::commands::check;
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
@@ -80,7 +81,7 @@ impl Flyer {
         shown.collect()
     }
 
-    /// Waits until `n_paths` robots of the world have a path for its next step.
+    /// Waits until the server has received the paths of `n_paths` robots for the world's next step.
     fn wait_for_paths(&self, n_paths: u32) {
         let has_come = || match self.wire.ask(&Request::Status {}) {
             Reply::Status(status) => status.worlds[0].n_paths == n_paths,
@@ -95,8 +96,8 @@ fn path(k: u64, robot: u32) -> Vec<u8> {
     path_to_bytes(&Paths::new(k * u64::from(TEAM) + u64::from(robot)).next(N_MOVES))
 }
 
-/// Flies four robots with one client for each range in `shares`. Returns the observations. The order in which the
-/// clients send their paths changes with each step.
+/// Flies four robots, with one client for each range of robots in `shares`, and returns the observations. The clients
+/// send their paths in another order in each step.
 fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
     let flyer = |robots: &Range<u32>| Flyer::new(server, robots.clone());
     let flyers: Vec<_> = shares.iter().map(flyer).collect();
@@ -216,7 +217,8 @@ impl Lab {
         agents
     }
 
-    /// Steps until `wanted` returns true for a result. Checks that every step has the result that its paths imply.
+    /// Steps the world until `wanted` returns true for its result. Checks that every step has the result that its paths
+    /// imply.
     fn until(&mut self, agents: &[&Program], mut wanted: impl FnMut(&WorldResult) -> bool) {
         let start = Instant::now();
         while !wanted(&self.step()) {
@@ -231,7 +233,7 @@ impl Lab {
     }
 }
 
-/// Returns whether all robots flew.
+/// Returns whether all robots flew in the last step.
 fn all_fly(world: &WorldResult) -> bool {
     world.hovered | world.late == 0
 }
@@ -280,7 +282,7 @@ fn a_stopped_agent_delays_its_world_until_its_lease_ends() {
     let holder = lab.server.status().worlds[0].holder_pids[3];
     assert_eq!(holder, None);
     three.signal(Signal::CONT);
-    // The world does not wait for this robot, so the agent learns of the refusal only with its next request.
+    // The world does not wait for this robot, so its agent notices that it has lost the lease only at its next request.
     three.ends(3).check_says("lease lost");
 }
 
@@ -335,13 +337,15 @@ fn agents_disturbed_at_random_change_nothing_for_the_others() {
     }
 }
 
-/// Flies four robots with one agent for each range in `parts`, in a world with many fires. Returns paths and reward.
+/// Flies four robots in a world with many fires, with one agent for each range of robots in `parts`. Returns the paths
+/// and the reward.
 fn flown_by(parts: &[Range<u32>], company: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
     const N_STEPS: usize = 40;
     let server = Server::start(
         "--model wildfire-small --height 16 --width 14 --moves 8 --burn-in 300 --robots 4",
     );
-    // Holds all robots, so that the world does not move until each robot has its agent.
+    // Holds all robots until the agents take them over, so that the world does not move before each robot has its
+    // agent.
     let _holder = server.acquire(0..4);
     let frames = Observer::frames(&server.instance).expect("the channel");
     let start = |robots: &Range<u32>| {

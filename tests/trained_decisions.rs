@@ -1,4 +1,5 @@
-//! Tests of `emberwatch-agent train --learner decisions`, which trains a filter, and then the choice between options.
+//! Tests of `emberwatch-agent train --learner decisions`, which first trains a filter, and then a network that chooses
+//! between options.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
@@ -28,7 +29,7 @@ fn place() -> Place {
     Place::new(SETTINGS, HEADER)
 }
 
-/// Returns the number of world steps at the end of a training, and checks that its losses are finite.
+/// Returns the number of world steps at the end of a training. Checks that its last loss is finite.
 fn steps(place: &Place, out: &str) -> String {
     let rows = place.rows(out);
     let row = rows.last().expect("rows");

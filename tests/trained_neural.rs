@@ -1,4 +1,5 @@
-//! Tests of `emberwatch-agent train --learner neural`, which learns a belief from frames. Policies act on this belief.
+//! Tests of `emberwatch-agent train --learner neural`, which learns to compute a belief from frames, and of policies
+//! that use this belief.
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};

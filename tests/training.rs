@@ -82,13 +82,13 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
             let flags = format!("--worlds 2 --steps {} {resume}", stop - done);
             let ended = place.train(out, &format!("{} {flags}", on(&server)));
             assert!(!ended.stderr.contains("start anew"), "{}", ended.stderr);
-            // Two worlds step together, so the number of steps is even.
+            // The number of steps is even, because the two worlds always step together.
             done = stop.next_multiple_of(2);
         }
         (place.rows(out), place.contents(out))
     };
     let (rows, whole) = train("whole", &[200]);
-    // Stops during the random walk, within a block and a window, and after the first updates.
+    // Stops the training three times: during the random walk, within a block and a window, and after the first updates.
     let (rows_of_parts, parts) = train("parts", &[22, 61, 100, 200]);
     assert_eq!(rows, rows_of_parts);
     let losses: Vec<f64> = rows.iter().filter_map(|row| row[2].parse().ok()).collect();
@@ -104,7 +104,8 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
     let place = place();
     place.train("path", &format!("{WORLDS} --steps 120"));
     place.train("full", &format!("{WORLDS} --steps 120 --coverage full"));
-    // The replay buffer stores 54 cells per step, while a path of five moves shows at most six.
+    // With full frames, the replay buffer stores 54 cells per step. Otherwise it stores at most six, the cells on a
+    // path of five moves.
     let size = |out: &str| place.bytes(out).len();
     assert!(2 * size("full") > 3 * size("path"));
     // On a new server the replay buffer starts empty, and fills with full frames again.
@@ -178,7 +179,7 @@ fn a_moved_world_begins_a_new_track_and_keeps_the_replay() {
 fn a_number_that_is_not_finite_ends_training_by_name() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
-    // The moment is finite, but a large step along it is not.
+    // The saved moment is finite, but the update step that it causes at a high learning rate is not.
     place.set(&format!("{SETTINGS}rate = 1.0\nobservation_rate = 100.0\n"));
     let mut contents = place.contents("out");
     for (name, number) in [("first_moment", f32::MAX), ("second_moment", 0.0)] {
@@ -202,7 +203,7 @@ fn a_number_that_is_not_finite_ends_training_by_name() {
     }
     assert_eq!(n_updates(&saved), next - 1);
     assert!(place.rows("out").len() >= n_rows);
-    // The checkpoint loads completely: a later run fails at the same point.
+    // The checkpoint is complete, so a later run resumes from it and fails at the same point.
     place.refuse("out", &resume, "likelihood: expected finite numbers");
 }
 

@@ -61,7 +61,8 @@ impl Place {
         check(AGENT, &self.words(out, flags), words);
     }
 
-    /// Checks that the flags in each line of a table are refused. A line has flags, an arrow and words of the error.
+    /// Checks that the flags in each line of a table are refused. Each line consists of flags, an arrow, and words of
+    /// the error.
     pub fn refuse_all(&self, out: &str, flags: &str, table: &str) {
         for line in table.lines() {
             let (more, words) = line.split_once(" => ").expect("flags and words");

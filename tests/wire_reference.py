@@ -1,11 +1,13 @@
 """An independent client, written from PROTOCOL.md, with iceoryx2's Python binding.
 
-It shares no code with the other clients, so that it does not repeat their errors.
-"Section" refers to PROTOCOL.md. `wire_reference.py INSTANCE` connects and sends the requests of
-the compliance suite. Each line of its standard input is a request, `{"service": "step",
-"header": "<hex>", "payload": "<hex>"}`; the client itself fills in the last 16 bytes of the
-header, the listener's id. Each line of its standard output is an answer, `{"header": "<hex>",
-"payload": "<hex>"}`. It fails if an answer violates PROTOCOL.md.
+It shares no code with the other clients, so that it does not repeat their errors. Sections in the
+comments are sections of PROTOCOL.md.
+
+`wire_reference.py INSTANCE` connects and sends the requests of the compliance suite. Each line of
+its standard input is a request, `{"service": "step", "header": "<hex>", "payload": "<hex>"}`. The
+client itself fills in the last 16 bytes of the header, which contain the listener's id. Each line
+of its standard output is an answer, `{"header": "<hex>", "payload": "<hex>"}`. The program fails if
+an answer violates PROTOCOL.md.
 """
 
 import contextlib
@@ -29,7 +31,7 @@ VERSION = 2
 #: Maximum number of nodes, listeners and notifiers per service.
 MAX_NODES = 64
 
-#: Maximum wait for a turn or an answer, in seconds.
+#: Maximum wait for the lock or for an answer, in seconds.
 TIMEOUT = 10.0
 
 SHARED_MEMORY = Path("/dev/shm")
@@ -65,7 +67,7 @@ LAYOUTS = {
 
 
 def header_type(name: str) -> Any:
-    """Returns the type of a header for iceoryx2: a structure with a type name."""
+    """Returns a header's type for iceoryx2: a ctypes structure that also has a type name."""
     layout, names = LAYOUTS[name]
     kinds = {"I": ctypes.c_uint32, "Q": ctypes.c_uint64}
     fields = [(field, kinds[it]) for field, it in zip(names.split(), layout[1:], strict=True)]
@@ -128,7 +130,7 @@ def turn() -> Iterator[None]:
 
 
 def make_way() -> None:
-    """Section 1: checks for free space, and waits for unfinished files, which block iceoryx2."""
+    """Section 1: checks for free space. Waits for unfinished files, which would block iceoryx2."""
     free, start = os.statvfs(SHARED_MEMORY), time.monotonic()
     check(free.f_bavail * free.f_frsize >= 512 << 10, "512 KiB of shared memory", free)
     check(free.f_files == 0 or free.f_favail >= 48, "room for 48 files", free)
@@ -146,7 +148,7 @@ def is_unfinished(path: Path) -> bool:
 
 
 def fill_segments() -> None:
-    """Section 1: allocates the memory of this process's segments, whose names contain its ids."""
+    """Section 1: allocates the memory of segments whose names contain an id of this process."""
     for path in SHARED_MEMORY.glob(f"{PREFIX}*"):
         words = path.name.removeprefix(PREFIX).partition(".")[0].split("_")
         ids = [int(word) for word in words if word.isdecimal() and len(word) < 40]
@@ -156,7 +158,7 @@ def fill_segments() -> None:
 
 
 def create_node() -> Any:
-    """Section 1: creates a node with its own paths, without iceoryx2's signals and clean-ups."""
+    """Section 1: creates a node in our directory. Disables iceoryx2's signals and clean-ups."""
     config: Any = iox2.config.default()
     config.global_cfg.root_path = iox2.Path.new(f"{ROOT}/")
     config.global_cfg.prefix = iox2.FileName.new(PREFIX)
@@ -179,7 +181,7 @@ class Port:
         builder = service.request_response(BYTES, BYTES).request_header(header_type(request))
         opened = builder.response_header(header_type(reply)).open()
         check(opened.dynamic_config.number_of_servers == 1, "a server", "none")
-        # Other clients allocate statically for their longest step. The suite sends longer ones.
+        # The memory can grow, because the suite sends longer requests than a valid step needs.
         port = opened.client_builder().initial_max_slice_len(4096)
         self._port = port.allocation_strategy(iox2.AllocationStrategy.PowerOfTwo).create()
 
@@ -192,7 +194,7 @@ class Port:
         return pending
 
     def take(self, pending: Any, response: Any) -> tuple[bytes, bytes]:
-        """Copies an answer's header and payload, and frees the answer for the next request."""
+        """Copies an answer's header and payload, and frees the answer's memory."""
         header = ctypes.string_at(response.user_header_ptr, self._size)
         payload = ctypes.string_at(response.payload_ptr, response.payload().len())
         response.delete()
@@ -204,7 +206,7 @@ class Client:
     """A connection to a server."""
 
     def __init__(self, instance: str) -> None:
-        """Opens all services in one turn, then sends `hello`."""
+        """Opens all services while it holds the lock, then sends `hello`."""
         self._process: int | None = None
         check_places()
         with turn():
@@ -235,13 +237,13 @@ class Client:
         self._process = os.pidfd_open(self._info["pid"])
 
     def step(self, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
-        """Sends a step request, valid or not, and checks the answer."""
+        """Sends a step request, which may be invalid, and checks the answer."""
         answer = self._exchange(self._step, header, payload)
         self._check_step(read("StepRequest", header), read("StepReply", answer[0]), answer[1])
         return answer
 
     def control(self, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
-        """Sends bytes on `control`, valid or not, and checks the answer."""
+        """Sends bytes on `control`, which may be invalid, and checks the answer."""
         answer = self._exchange(self._control, header, payload)
         request, reply = read("ControlRequest", header), read("ControlReply", answer[0])
         told = (reply["version"], reply["sequence"])
@@ -256,14 +258,14 @@ class Client:
         self._notifier.notify()
         start, is_gone = time.monotonic(), False
         while True:
-            # Receives before it checks for the server's end, because the last answer may precede it.
+            # Receives once more after the server's end, because an answer may have come before it.
             response = pending.receive()
             if response is not None:
                 return port.take(pending, response)
             waited = time.monotonic() - start
             check(not is_gone and waited < TIMEOUT, "an answer", f"none after {waited} s")
             if waited > 100e-6:
-                # Also discards pending wake-ups.
+                # Waits for a wake-up, and discards all that are pending.
                 self._listener.timed_wait(iox2.Duration.from_millis(50))
                 watched = [] if self._process is None else [self._process]
                 is_gone = bool(select.select(watched, [], [], 0)[0])
@@ -300,7 +302,7 @@ class Client:
 
 
 def main() -> None:
-    """Sends the requests from standard input, until it ends."""
+    """Sends the requests from standard input, until the input ends."""
     iox2.set_log_level(iox2.LogLevel.Fatal)
     client = Client(sys.argv[1])
     for line in sys.stdin:

@@ -40,7 +40,7 @@ pub struct AgentFlags {
     pub agent_seed: Option<u64>,
 }
 
-/// Returns a parser for a flag with these values. Each has a name and an explanation for `--help`.
+/// Returns a parser for a flag with these values. Each value has a name and an explanation for `--help`.
 pub fn one_of<T: Copy + Send + Sync + 'static>(
     all: &'static [(T, &str, &str)],
 ) -> impl TypedValueParser<Value = T> {

@@ -7,8 +7,9 @@ use std::thread::available_parallelism;
 /// memory is returned to the system. A negative value means never.
 const PURGE_DELAY: libmimalloc_sys::mi_option_t = 15;
 
-/// Environment variables with candle's thread counts. Without the first, candle reads `/proc/cpuinfo` for each matrix
-/// product, which takes longer than a small product. The second counts threads that spin while they wait.
+/// Environment variables with candle's thread counts. If the first is not set, candle reads `/proc/cpuinfo` for each
+/// matrix product, which takes longer than a small product itself. The second is the number of threads that spin while
+/// they wait.
 const THREADS: [&str; 2] = ["RAYON_NUM_THREADS", "CANDLE_NUM_THREADS"];
 
 /// Keeps freed memory for the next tensor, and sets candle's thread counts. Programs whose global allocator is

@@ -1,8 +1,8 @@
 //! Trains a learner while it acts: a loop of steps of all robots, updates, and checkpoints at intervals.
 //!
 //! The learner receives the grid, the number of observation values, and each path's reward and frame. A model that the
-//! server reveals is read only for decisions on a known-model belief. One message steps all robots.
-//! The [`Learner`] determines what is learned, and how to act in the meantime.
+//! server reveals is read only for decisions on a known-model belief. One message to the server moves all robots by one
+//! step. The [`Learner`] determines what is learned, and how to act in the meantime.
 
 mod acting;
 mod events;
@@ -188,7 +188,7 @@ impl TrainingLoop {
         Ok(())
     }
 
-    /// Steps each robot once. Worlds whose episode has ended start the next one.
+    /// Steps each robot once. Worlds whose episode has ended start their next episode.
     fn step(&mut self) -> Result<Tick> {
         let shows_all = self.learner.wants_full_frames();
         let learner = &mut *self.learner;
@@ -296,7 +296,7 @@ fn begin(
     }
 }
 
-/// Observes the client's robots. Worlds whose episode has ended start the next one first.
+/// Returns the observations of the client's robots. Worlds whose episode has ended start their next episode first.
 fn running(client: &mut Client) -> Result<Vec<Observation>, ConnectionError> {
     let mut observations = client.observe(client.robots())?;
     let over = ended(client, observations.iter());

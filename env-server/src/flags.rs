@@ -60,7 +60,7 @@ pub struct ServerFlags {
     /// Number of moves in a path [default: 64]
     #[arg(long)]
     pub moves: Option<usize>,
-    /// Seed of world 0; world i starts from this plus i [default: 0]
+    /// Seed of world 0; world i starts from this seed plus i [default: 0]
     #[arg(long)]
     pub seed: Option<u64>,
     /// Number of steps simulated before k = 0 [default: 10000]
@@ -113,7 +113,7 @@ pub enum CoverageFlag {
     Path,
     /// Every cell
     Full,
-    /// The cells on the path, or every cell when a step asks for it
+    /// The cells on the path, or every cell if the step request asks for it
     Client,
 }
 

@@ -1,7 +1,7 @@
 //! The wire between a server and its clients: channels over shared memory (iceoryx2), connections and observers.
 //!
-//! A [`Client`] flies robots; `examples/random_robot.rs` is a complete program. It sends the requests of [`control`]
-//! and [`message`] over a [`Connection`]. An [`observer`] reads the samples that a server publishes, and a
+//! A [`Client`] flies robots: it sends the requests of [`control`] and [`message`] over a [`Connection`]. A complete
+//! program is `examples/random_robot.rs`. An [`observer`] reads the samples that a server publishes, and a
 //! [`recording`] stores them in a file. [`responder`], [`channels`] and [`failed_connections`] are for servers.
 //!
 //! The crate `emberwatch-messages` contains the messages, and `emberwatch-model` the mathematics of the worlds. The

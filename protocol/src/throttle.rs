@@ -1,5 +1,5 @@
-//! Limits repeated warnings: logs one, and later the number that were suppressed. It reads no clock; time is an
-//! argument.
+//! Limits repeated warnings: logs one, and later the number that were suppressed. It reads no clock: the caller passes
+//! the current time.
 
 use std::time::{Duration, Instant};
 

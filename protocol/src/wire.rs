@@ -2,7 +2,7 @@
 //!
 //! [`channels`] are the services that carry the messages of the crate `emberwatch-messages`. [`connection`] is a
 //! client's side, [`responder`] the answering side, and [`observer`] a reader's side. [`node`], [`turn`] and
-//! [`cleanup`] create and remove channels, and [`shared_memory`] allocates their memory. [`wait`] is the wait with a
+//! [`cleanup`] create and remove channels, and [`shared_memory`] allocates their memory. [`wait`] waits with a
 //! deadline.
 
 pub mod agent_belief;

@@ -1,6 +1,6 @@
-//! Measures how soon the death of a process is noticed: `cargo bench -p tests --bench endings`.
+//! Measures how soon programs notice the death of a process: `cargo bench -p tests --bench endings`.
 //!
-//! The reference is the time until this process notices the same death through a pidfd.
+//! The reference is the time after which a pidfd reports the same death to this process.
 
 use emberwatch_protocol::control::Request;
 use emberwatch_protocol::wait::sleep_until_readable;

@@ -1,9 +1,9 @@
-//! Round trip of a step from a Rust client to a server process and back:
-//! `cargo bench -p tests --bench round_trip`; arguments after `--` go to the server.
+//! Measures the round trip of a step from a Rust client to a server process and back. Run it with `cargo bench -p tests
+//! --bench round_trip`; arguments after `--` are passed to the server.
 //!
-//! Prints median and tail latency in microseconds, without the time that the simulation takes: first on the machine as
-//! it is, then with three additional busy processes. Then prints the processor time of an idle server. `scripts/bench`
-//! measures Gymnasium's AsyncVectorEnv in the same run for comparison.
+//! Prints the median and tail latency in microseconds, excluding the time of the simulation. Measures first on the
+//! machine as it is, then with three additional busy processes. Then prints the processor time of an idle server.
+//! `scripts/bench` measures Gymnasium's AsyncVectorEnv in the same run for comparison.
 
 use std::ops::Range;
 use std::sync::Barrier;
@@ -15,7 +15,7 @@ use tests::stepper::Stepper;
 
 const N_STEPS: usize = 50_000;
 
-/// A client whose robots repeat the same paths.
+/// A client whose robots fly the same paths in every step.
 struct Flight {
     stepper: Stepper,
     paths: Vec<u8>,
@@ -29,7 +29,7 @@ impl Flight {
         Self { stepper, paths }
     }
 
-    /// Returns the nanoseconds of one round trip, and the part that the simulation took.
+    /// Returns the duration of one round trip and the part of it spent in the simulation, in nanoseconds.
     fn step(&mut self) -> (u64, u64) {
         let start = Instant::now();
         let answer = self.stepper.step(&self.paths);
@@ -59,7 +59,7 @@ fn spread(nanos: impl Iterator<Item = u64>) -> String {
 }
 
 fn main() {
-    // Cargo itself adds `--bench`.
+    // Drops `--bench`, which Cargo itself adds.
     let more = std::env::args()
         .skip(1)
         .filter(|argument| argument != "--bench")

@@ -1,6 +1,7 @@
-//! Example of a custom estimator: it acts on worlds in this process, and is compared with policies of the benchmark.
+//! Example of a custom estimator. A policy based on it acts on worlds in this process and is compared with policies of
+//! the benchmark.
 //!
-//! The estimator believes that each cell is still in the state last observed there, with a confidence that decreases
+//! The estimator assumes that each cell is still in the state last observed there, with a confidence that decreases
 //! each step. Run it with `cargo run --release -p tests --example own_belief`.
 
 use anyhow::Result;
@@ -25,7 +26,7 @@ const KEPT: f32 = 0.95;
 const WORLDS: u32 = 4;
 const STEPS: u64 = 100;
 
-/// An estimator that believes the last observation of each cell. This belief decays to the initial belief.
+/// An estimator whose belief about a cell is based on the last observation there and then decays to the initial belief.
 struct LastSeen {
     belief: Belief,
     first: Belief,
@@ -80,7 +81,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// Returns the mean reward per step of a policy. Every policy gets the same worlds.
+/// Returns the mean reward per step of a policy. Every policy acts on the same worlds.
 fn mean_reward(policy: &Policy, model: &Model) -> Result<f64> {
     let settings = ServerConfig {
         worlds: WORLDS,

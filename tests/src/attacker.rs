@@ -13,7 +13,8 @@ use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// One control request of each kind. Excludes shutdown, takeovers and file requests, which any client may use.
+/// One control request of each kind. Shutdown, takeovers and file requests are excluded, because any client may use
+/// these.
 const TEMPLATES: [&str; 8] = [
     r#"{"op":"hello","protocol":2,"client":"x"}"#,
     r#"{"op":"acquire","first_robot":1,"n_robots":1}"#,
@@ -29,7 +30,7 @@ const TEMPLATES: [&str; 8] = [
 pub struct Attacker {
     wire: Wire,
     rng: ChaCha8Rng,
-    /// Leases to try: no lease, the attacker's lease and the victim's lease.
+    /// Lease tokens for requests: none, the attacker's and the victim's.
     leases: Vec<u64>,
     /// The latest step that an answer reported.
     k: u64,
@@ -137,7 +138,7 @@ impl Attacker {
         Some(reply.status)
     }
 
-    /// Returns the right number in most cases, and otherwise a number that is close, huge or random.
+    /// Returns `right` in most cases, and otherwise a number that is off by one, huge or random.
     fn number(&mut self, right: u32) -> u32 {
         match self.rng.random_range(0..50) {
             0 => right.wrapping_add(1),

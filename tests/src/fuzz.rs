@@ -109,7 +109,8 @@ mod tests {
     fn the_texts_of_the_corpus_are_of_this_release() {
         let reply: fn(&str) -> bool = |text| parse::<Reply>(text.as_bytes()).is_ok();
         let model: fn(&str) -> bool = |text| Model::from_toml(text).is_ok();
-        // Skips the first byte, which selects the events before the request.
+        // Skips the first byte, which is not part of the request: it selects the client and the events before the
+        // request.
         let request: fn(&str) -> bool =
             |text| parse::<Request>(text[1..].replace("LEASE", "1").as_bytes()).is_ok();
         for (folder, names, is_read) in [

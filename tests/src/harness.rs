@@ -28,13 +28,13 @@ pub use crate::programs::{
     repository, run,
 };
 
-/// How long a starting server may take to answer before the request is repeated.
+/// How long to wait for the answer of a starting server before the request is sent again.
 const START: Duration = Duration::from_secs(3);
 
 /// A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 pub const SMALL: &str = "--height 5 --width 7 --moves 6 --burn-in 20";
 
-/// A number of burn-in steps that takes forever.
+/// A number of burn-in steps so large that the burn-in never ends.
 pub const ENDLESS: u64 = 1 << 40;
 
 /// The latest result of a world, and the result and frame of one of its robots.
@@ -66,7 +66,7 @@ impl Server {
         server
     }
 
-    /// Starts a server on an instance, which may not answer yet.
+    /// Starts a server on an instance and returns immediately, when the server may not answer yet.
     pub fn start_without_waiting(instance: &Instance, flags: &str) -> Self {
         let arguments = format!("--instance {} {flags}", instance.name());
         Self {
@@ -83,7 +83,8 @@ impl Server {
         server
     }
 
-    /// Starts a server with two worlds at k = 0, which have the size of [`SMALL`]. Resets of these worlds never end.
+    /// Starts a server with two worlds of the size of [`SMALL`] at k = 0. If these worlds are reset, the burn-in never
+    /// ends.
     pub fn start_with_endless_resets(flags: &str) -> Self {
         let WorldSpec {
             settings,
@@ -156,7 +157,7 @@ impl Server {
     }
 }
 
-/// Returns a claim that takes robots over from their holders.
+/// Returns the claim for a lease that takes robots over from their holders.
 pub fn takeover(robots: Range<u32>) -> Claim {
     Claim {
         takeover: true,
@@ -164,7 +165,7 @@ pub fn takeover(robots: Range<u32>) -> Claim {
     }
 }
 
-/// Returns the seed for a reset of a world; with `None`, the server chooses it.
+/// Returns the seed of one world for a reset request. If `seed` is `None`, the server chooses it.
 pub fn seed(world: u32, seed: impl Into<Option<u64>>) -> WorldSeed {
     WorldSeed {
         world,
@@ -180,7 +181,7 @@ pub fn new_instance() -> Instance {
     Instance::new(&name).expect("a plain name")
 }
 
-/// Returns the description of a server with one world of 2 x 3 cells, for a recording.
+/// Returns the description of a server with one world of 2 x 3 cells, to be stored in a recording.
 pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
     let text = r#"{"protocol":2,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":0,"n_worlds":1,"n_robots":0,
         "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
@@ -278,13 +279,13 @@ pub fn path_of(sample: &Sample<FrameHeader>) -> Vec<Move> {
     path_from_bytes(robots_of(sample)[0].path).expect("a path")
 }
 
-/// Returns the content of a published step with one robot in the form of [`Server::observe`].
+/// Converts a published step with one robot to the form that [`Server::observe`] returns.
 pub fn seen_in(sample: &Sample<FrameHeader>) -> Seen {
     let robot = &robots_of(sample)[0];
     (sample.header.result, robot.result, robot.frame.to_vec())
 }
 
-/// Returns a client's observation in the form of [`Server::observe`].
+/// Converts a client's observation to the form that [`Server::observe`] returns.
 pub fn seen_by(observation: &Observation) -> Seen {
     let frame = observation.frame.as_bytes().to_vec();
     (observation.world, observation.robot, frame)

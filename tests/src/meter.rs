@@ -54,7 +54,8 @@ impl std::fmt::Display for Use {
     }
 }
 
-/// Reads the value of a line, in KiB, from `/proc/<pid>/status`. Returns 0 if there is no such line.
+/// Parses the value, in KiB, from the line of `/proc/<pid>/status` that begins with `line`. Returns 0 if there is no
+/// such line.
 pub fn memory(line: &str, pid: u32) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
     let found = status.lines().find_map(|text| text.strip_prefix(line));

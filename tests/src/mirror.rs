@@ -1,5 +1,5 @@
-//! A copy of a server's world that repeats the published steps in this process, to check them. Also a world on a server
-//! that steps only as fast as its steps are checked.
+//! [`Mirror`] is a copy of a server's world in this process, which repeats the published steps to check them.
+//! [`PacedWorld`] is a world on a server that waits after each step until the step is checked.
 
 use crate::harness::{PATIENCE, Paths, Server, frames_until, robots_of};
 use emberwatch_protocol::client::Claim;
@@ -25,7 +25,8 @@ pub struct Mirror {
 }
 
 impl Mirror {
-    /// Creates the world at k = 0 of the first episode. Settings that are not in `info` must have their defaults.
+    /// Creates the world at k = 0 of the first episode. The server's settings that `info` does not contain must have
+    /// their default values.
     pub fn of(info: &ServerInfo) -> Self {
         let config = ServerConfig {
             height: info.height,
@@ -42,8 +43,8 @@ impl Mirror {
         Self { rules, episode }
     }
 
-    /// Repeats a published step with the paths and masks of its sample. Returns false if the sample repeats the
-    /// previous one.
+    /// Repeats a published step with the paths and masks in its sample. Returns false if the sample shows the same step
+    /// as the previous one.
     ///
     /// # Panics
     /// If a step is missing, or the sample differs from the result of its paths.
@@ -71,7 +72,7 @@ impl Mirror {
     }
 }
 
-/// Repeats a step from its result and the robots' paths, which are empty for robots that hovered or were late.
+/// Repeats a step, given its result and the robots' paths. The paths of robots that hovered or were late are empty.
 pub fn step_again(
     episode: &mut Episode,
     rules: &Rules,
@@ -104,7 +105,8 @@ fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
     (robot.frame().as_bytes(), path_to_bytes(robot.path()))
 }
 
-/// World 0 of a server. This process flies one robot, and checks each step before the next one, so that it misses none.
+/// World 0 of a server. This process flies one robot. It checks each step before it sends the next path, so that it
+/// misses no step.
 pub struct PacedWorld {
     pub client: Client,
     pub last: WorldResult,
@@ -131,7 +133,7 @@ impl PacedWorld {
         }
     }
 
-    /// Flies a path, checks all steps published by then, and passes each step to `tell`.
+    /// Flies a path, then checks all steps that have been published since the last call and passes each to `tell`.
     pub fn step(&mut self, mut tell: impl FnMut(&Sample<FrameHeader>)) {
         let path = self.paths.next(self.client.info().n_moves);
         let (start, robots) = (Instant::now(), self.client.robots());
@@ -139,7 +141,7 @@ impl PacedWorld {
         let flown = self.client.step_until(robots.clone(), &[path], &is_over);
         match flown {
             Ok(Some(_)) => {}
-            // This process was scheduled too late. It continues with the next step.
+            // The path was late, because this process was not scheduled in time. It continues with the next step.
             Err(ConnectionError::Refused {
                 status: Status::Late,
                 ..

@@ -8,7 +8,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 use tempfile::TempDir;
 
-/// Time limit for operations that should take milliseconds. It is shorter than a lease of 30 s.
+/// Time limit for operations that should take milliseconds. It is shorter than the default duration of a lease, 30 s.
 pub const PATIENCE: Duration = Duration::from_secs(25);
 
 pub const LIMIT: Duration = Duration::from_secs(60);
@@ -94,7 +94,7 @@ impl Program {
             .stdout(file("stdout"))
             .stderr(file("stderr"))
             .env("RUST_LOG", "info")
-            // Keeps the program from using the user's cache: nothing can be stored here.
+            // Keeps the program from using the user's cache, because no files can be created below this path.
             .env("XDG_CACHE_HOME", "/dev/null")
             .spawn();
         Self {

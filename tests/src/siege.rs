@@ -15,8 +15,8 @@ use std::time::Duration;
 pub const FLAGS: &str =
     "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3 --lease-millis 86400000";
 
-/// Maximum growth of a server's private memory. The allocator keeps some of the longest request's memory (up to 5 MiB
-/// were measured). The tables of clients are bounded.
+/// Maximum growth of a server's private memory. It is not 0, because the allocator keeps some of the longest request's
+/// memory (up to 5 MiB were measured) and tables of clients grow up to a limit.
 const MOST_GROWTH_KIB: u64 = 8 << 10;
 
 /// Pause between the victim's steps, which leaves processor time for the attacker.
@@ -42,7 +42,7 @@ pub fn besiege(attack: impl FnOnce(&Server, u64)) {
         let victim = scope.spawn(|| live(&server.instance, &tell_lease, &stop));
         let stolen = stolen.recv_timeout(PATIENCE).expect("a lease");
         let before = Holdings::of(server.program.pid());
-        // Stops the victim even if the attack panics. Otherwise the victim would never end.
+        // Stops the victim when dropped, because the victim would never end if the attack panicked.
         let stopped = Stop(&stop);
         attack(&server, stolen);
         check_holdings(server.program.pid(), &before);
@@ -62,7 +62,7 @@ impl Drop for Stop<'_> {
     }
 }
 
-/// Runs the victim: steps world 0 until `stop` is set. Returns every answer's payload.
+/// Runs the victim, which steps world 0 until `stop` is set. Returns the payloads of all answers.
 fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec<Vec<u8>> {
     let wire = Wire::open(instance);
     let lease = wire.acquire(0..1).lease;
@@ -81,7 +81,7 @@ fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec
     seen
 }
 
-/// Asserts that a server without an attacker gives the same answers.
+/// Checks that a server without an attacker gives the same answers to the same requests.
 fn assert_undisturbed(seen: &[Vec<u8>]) {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);

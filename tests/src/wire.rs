@@ -1,5 +1,5 @@
-//! Sends raw headers and payloads, as a client in another language or a hostile client would. Nothing is filled in or
-//! checked.
+//! Sends raw headers and payloads, as a client in another language or a hostile client would. Fields are sent as given
+//! and are not checked.
 
 use crate::programs::PATIENCE;
 use emberwatch_protocol::channels::{
@@ -41,7 +41,8 @@ pub trait RawClient {
     /// Returns the process id that the server sees as the client's.
     fn pid(&self) -> u32;
 
-    /// Sends a well-formed control request, and checks that the status in the header equals the reply's.
+    /// Sends a well-formed control request, and checks that the header of the answer has the same status as the reply
+    /// in its payload.
     fn ask(&self, request: &Request) -> Reply {
         let text = serde_json::to_vec(request).expect("requests serialise");
         let (header, payload) = self.control(control_header(7), &text);
@@ -167,7 +168,7 @@ pub fn recall_header(robots: Range<u32>) -> StepRequest {
     }
 }
 
-/// Returns the payload of a step of worlds at these steps.
+/// Returns the payload of a step request for worlds that are at these steps.
 pub fn step_body(steps: &[u64], paths: &[u8]) -> Vec<u8> {
     let mut body = Vec::new();
     write_step_body(steps, paths, &mut body);

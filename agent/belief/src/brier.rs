@@ -5,9 +5,9 @@ use emberwatch_model::Grid;
 
 /// Computes the Brier score of one state: the mean over all cells of `(p - 1[x = target])^2`.
 ///
-/// `p` is the believed probability of the state. The state has index `target` in `truth` and index `own` in the belief.
-/// A perfect belief scores 0. If a fraction `q` of the cells is in the state, a belief with `p = q` in every cell
-/// scores `q (1 - q)`.
+/// `p` is the believed probability of the state. This state has index `target` in `truth` and index `own` in the
+/// belief. A perfect belief scores 0. If a fraction `q` of the cells is in the state, a belief with `p = q` in every
+/// cell scores `q (1 - q)`.
 pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize) -> f64 {
     let squared = |(&p, &state): (&f32, &u8)| {
         let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
@@ -20,7 +20,7 @@ pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize)
 /// Computes the log loss: the mean over all cells of `-ln p` in nats, where `p` is the believed probability of the
 /// cell's true state.
 ///
-/// Infinite if some `p` is 0.
+/// The log loss is infinite if `p` is 0 in some cell.
 ///
 /// # Panics
 /// If `truth` contains a state that the belief lacks.
@@ -30,11 +30,12 @@ pub fn log_loss(belief: &Belief, truth: &Grid<u8>) -> f64 {
         f64::from(probability).ln()
     };
     let sum: f64 = truth.indexed_iter().map(log).sum();
-    // 0 instead of -0 for a perfect belief.
+    // The subtraction returns 0, not -0, for a perfect belief.
     0.0 - sum / truth.len() as f64
 }
 
-/// Computes the fraction of cells whose most probable state is the true state. Ties go to the first state.
+/// Computes the fraction of cells whose most probable state is the true state. If several states are equally probable,
+/// the first one counts.
 pub fn accuracy(belief: &Belief, truth: &Grid<u8>) -> f64 {
     let numbers = belief.as_slice();
     let is_right = |&(index, &state): &(usize, &u8)| {
@@ -64,7 +65,7 @@ mod tests {
         let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
         assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
         assert!((log_loss(&uniform, &truth) - 3.0_f64.ln()).abs() < 1e-6);
-        // All states tie, so state 0 is chosen. It is the true state of half the cells.
+        // All states are equally probable, so state 0 is chosen, which is the true state of half the cells.
         assert_eq!(accuracy(&uniform, &truth), 0.5);
     }
 }

@@ -1,11 +1,11 @@
 //! Beliefs about a partly observed grid of hidden states, and plans based on these beliefs.
 //!
-//! The code is pure: frames, seeds and steps are arguments. It reads no clock and writes no log, and only
-//! [`estimation::kept_belief`] accesses files.
+//! Results depend only on arguments, such as frames, seeds and steps. The crate reads no clock and writes no log, and
+//! only [`estimation::kept_belief`] accesses files.
 //!
 //! - [`estimation`]: from frames to a belief about every cell (paper sections III.A to III.C)
 //! - [`planning`]: from a belief to a path (paper section III.D)
-//! - [`merit`], [`brier`]: scores of a run and of a belief
+//! - [`merit`], [`brier`]: figures of merit of a run, and scores of a belief
 
 #![allow(missing_docs, reason = "self-explanatory names need no docs")]
 

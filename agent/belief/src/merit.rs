@@ -1,6 +1,6 @@
 //! Common figures of merit of one run, as defined in `docs/figures-of-merit.md`.
 //!
-//! They need no model, only the index of the target state. Two figures also need the hidden states.
+//! The figures need no model, only the index of the target state. Two figures also need the hidden states.
 
 use emberwatch_model::path::Flight;
 use emberwatch_model::{Cell, Grid, Shape};
@@ -13,13 +13,13 @@ pub const RECENT_STEPS: u32 = 10;
 pub struct Merit {
     /// Number of steps until a robot first visited a burning cell.
     pub steps_to_detection: Option<u64>,
-    /// Number of burning cells of the world at that step.
+    /// Number of burning cells in the world at the step of that visit.
     pub burning_cells_at_detection: Option<u32>,
     /// Fraction of the burning cells that a robot visited in the last [`MeritTally::recent_steps()`] steps, averaged
     /// over steps with fire.
     pub burning_seen_share: Option<f64>,
     /// Number of moves from the nearest robot to the nearest burning cell that no robot visited recently, averaged over
-    /// steps with such a cell.
+    /// the steps in which there is such a cell.
     pub front_distance: Option<f64>,
     /// Fraction of all cells that any robot visited during the run.
     pub grid_seen_share: f64,
@@ -72,7 +72,7 @@ impl MeritTally {
         }
     }
 
-    /// Adds a step. `flights` contains the flight of each robot, and at least one. `states` are the hidden states
+    /// Adds a step. `flights` contains one flight per robot, and must not be empty. `states` are the hidden states
     /// during the flights, shape `[H, W]`, if they are known.
     pub fn update(&mut self, flights: &[Flight], found: Found, states: Option<&Grid<u8>>) {
         self.step += 1;
@@ -107,7 +107,7 @@ impl MeritTally {
     fn watch(&mut self, flights: &[Flight], states: &Grid<u8>) {
         let states = states.as_slice().expect("invariant: grids are row-major");
         let forgotten = self.step.saturating_sub(self.recent_steps);
-        // Without branches, so that the compiler vectorises the loop.
+        // Avoid branches, so that the compiler vectorises the loop.
         let (mut n_burning, mut n_seen) = (0_u32, 0_u32);
         for (&state, &visit) in states.iter().zip(&self.last_visits) {
             let burns = u32::from(state == self.target);
@@ -141,8 +141,8 @@ impl Mean {
     }
 }
 
-/// Returns the number of moves from a cell to the nearest cell that satisfies `is_one`, or `best` if none is nearer.
-/// Scans row by row, from the nearest rows outwards.
+/// Returns the number of moves from a cell to the nearest cell that satisfies `is_one`, or `best` if no such cell is
+/// nearer. Scans row by row, from the nearest rows outwards.
 fn nearest(shape: Shape, from: Cell, mut best: usize, is_one: impl Fn(usize) -> bool) -> usize {
     let (height, width) = shape.dim();
     for row_moves in 0..height {
@@ -216,7 +216,7 @@ mod tests {
         assert_eq!(of(got), (Some(1), Some(1)));
         let got = merit(9, &[("...#", &[&[0]]), ("...#", &[&[1]])]);
         assert_eq!((of(got), got.burning_seen_share), ((None, None), Some(0.0)));
-        // 3 moves, then 2.
+        // The distance is 3 moves in one step and 2 in the other.
         assert_eq!(got.front_distance, Some(2.5));
     }
 
@@ -244,8 +244,8 @@ mod tests {
     fn only_recent_visits_count_as_seen() {
         let steps: [(&str, &[&[usize]]); 3] =
             [("#..#", &[&[0]]), ("#..#", &[&[1]]), ("#..#", &[&[2]])];
-        // One of two burning cells is seen: in all 3 steps, in the first two, or in the first. The nearest unseen fire
-        // is 3, 2 and 1 moves away, or 3, 1 and 1 moves if cell 0 is forgotten after one step.
+        // One of two burning cells counts as seen in all 3 steps, in the first two, or only in the first. The nearest
+        // unseen fire is 3, 2 and 1 moves away, or 3, 1 and 1 moves if cell 0 is forgotten after one step.
         for (recent_steps, seen, moves) in [(3, 1.5, 6.0), (2, 1.0, 6.0), (1, 0.5, 5.0)] {
             let got = merit(recent_steps, &steps);
             assert_eq!(got.burning_seen_share, Some(seen / 3.0), "{recent_steps}");
@@ -261,7 +261,7 @@ mod tests {
             steps_to_detection: Some(1),
             burning_cells_at_detection: Some(3),
             burning_seen_share: Some(2.0 / 3.0),
-            // From cell 5 to 7, not from cell 1.
+            // Measured from cell 5 to cell 7, not from cell 1.
             front_distance: Some(2.0),
             grid_seen_share: 0.5,
         };

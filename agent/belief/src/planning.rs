@@ -1,7 +1,7 @@
 //! Planners, which turn a value per cell into a path (paper section III.D).
 //!
 //! An [`Objective`] converts a belief into [`CellValues`]. A [`Planner`] then searches for the path with the highest
-//! score: the cost of eq. 15 with the opposite sign and without its constant factor.
+//! score, which is the negative of the cost in eq. 15 without its constant factor.
 
 pub mod ahead;
 pub mod beam;

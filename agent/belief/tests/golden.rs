@@ -142,14 +142,14 @@ fn the_masked_posterior_agrees_along_a_path() {
     assert!(visited.next().is_none());
 }
 
-/// Returns the objective for an action of one of the reference's planner types. The last action is entropy.
+/// Returns the objective for an action of one of the reference's planner types. The last action stands for entropy.
 fn objective(planner_type: usize, action: usize) -> Objective {
     const DEFAULT: usize = 0;
     const RANDOM: usize = 1; // number of distinct cells, whatever the action
     Objective::paper(match planner_type {
         DEFAULT if action < 3 => Target::State(action),
         RANDOM => Target::Coverage,
-        // "Default" for action 3, and "VisitingGrayArea" for every action.
+        // Planner type "Default" with action 3, and "VisitingGrayArea" with any action.
         _ => Target::Entropy,
     })
 }
@@ -166,8 +166,8 @@ fn objective(planner_type: usize, action: usize) -> Objective {
 /// Case p3 checks that the reference has NaN exactly in this situation.
 ///
 /// Summing up to 64 numbers between 1 and 2 in a different order changes the result by up to 64 rounding errors of a
-/// number near 128. This is 5e-4 in the worst case, and below 5e-5 in these data. If the reference's best two scores
-/// are that close, either may win.
+/// number near 128. The difference is 5e-4 in the worst case, and below 5e-5 in these data. If the reference's best two
+/// scores differ by less, either may win.
 #[test]
 fn path_scores_and_winners_agree() {
     const TOLERANCE: f32 = 5e-5;
@@ -217,7 +217,8 @@ fn path_scores_and_winners_agree() {
     }
 }
 
-/// The reference's random walk clamps each move. Its first coordinate is the row, unlike in its planner.
+/// The reference's random walk clamps each move. The first coordinate of its positions is the row, unlike in the
+/// reference's planner.
 #[test]
 fn random_walks_fly_the_same_cells() {
     let mut golden = Golden::open("a5_planner");

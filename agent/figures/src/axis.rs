@@ -45,7 +45,8 @@ impl Axis {
         }
     }
 
-    /// Creates an axis from zero to exactly `n` (at least 1). Its ticks are whole numbers, not always including `n`.
+    /// Creates an axis from zero to exactly `n` (at least 1). Its ticks are whole numbers, and `n` is not always one of
+    /// them.
     pub fn counting_to(n: usize, n_ticks: usize) -> Self {
         let most = n as f64;
         let mut axis = Self::covering(std::iter::once(most), n_ticks.min(n));
@@ -103,8 +104,8 @@ fn round_step(step: f64) -> f64 {
     factor.unwrap_or(10.0) * power
 }
 
-/// Moves positions so that neighbours are at least `gap` apart, and that all lie in `least..=most` if they fit.
-/// Minimises the sum of squared displacements. Equal positions keep their order.
+/// Moves positions so that neighbours are at least `gap` apart, and so that all positions lie within `least..=most` if
+/// they fit. Minimises the sum of squared displacements. Equal positions keep their order.
 pub fn spread(positions: &[f64], gap: f64, (least, most): (f64, f64)) -> Vec<f64> {
     let mut order: Vec<usize> = (0..positions.len()).collect();
     order.sort_by(|&a, &b| positions[a].total_cmp(&positions[b]));

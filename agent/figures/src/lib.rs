@@ -1,4 +1,4 @@
-//! Charts: data in, SVG out, identical on every machine.
+//! Draws charts as SVG. The same data give the same SVG on every machine.
 //!
 //! [`Ladder`] draws bars, [`Lines`] curves over a common axis, and [`Snapshot`] the cells of one step. `svg` contains
 //! the drawing functions, and `axis` the scales. [`heat`] creates PNGs for TensorBoard, which cannot show SVG.

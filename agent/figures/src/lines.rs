@@ -8,7 +8,7 @@ use crate::text::TextStyle;
 /// Maximum number of curves per panel: the number of available colours.
 pub const MAX_CURVES: usize = LINES.len();
 
-/// Height of a panel including its title: one of several panels, or the only panel.
+/// Heights of a panel including its title: if there are several panels, and if there is only one.
 const PANEL: f64 = 190.0;
 const ONLY_PANEL: f64 = 556.0;
 /// Height of the page's title, and of the axis below the last panel.

@@ -69,7 +69,8 @@ pub fn sequential(probability: f32) -> Color {
     blend(SEQUENTIAL[below], SEQUENTIAL[below + 1], at - below as f64)
 }
 
-/// Returns the first grey that is clearly distinguishable from all given colours, otherwise the most distant grey.
+/// Returns the first candidate grey that is clearly distinguishable from all given colours. If there is none, returns
+/// the most distant candidate.
 pub fn unlike(colors: &[Color]) -> Color {
     let grey = |level: u8| Color(level, level, level);
     let nearest = |level: u8| {
@@ -81,7 +82,7 @@ pub fn unlike(colors: &[Color]) -> Color {
     grey(level.expect("invariant: there are neutrals"))
 }
 
-/// Mixes two colours: `from` at `fraction` 0, `to` at 1.
+/// Mixes two colours. The result is `from` if `fraction` is 0, and `to` if it is 1.
 pub fn blend(from: Color, to: Color, fraction: f64) -> Color {
     let channel = |from: u8, to: u8| {
         let (from, to) = (f64::from(from), f64::from(to));

@@ -16,7 +16,7 @@ pub type Point = (f64, f64);
 /// A row of adjacent squares: the upper left corner of the first square, and the number of squares.
 pub type Run = (Point, usize);
 
-/// The text anchor: the part of a text that is placed at its horizontal position.
+/// The text anchor: which part of a text (start, middle or end) is placed at the given horizontal position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Align {
     Left,

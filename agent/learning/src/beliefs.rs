@@ -47,10 +47,10 @@ pub fn named(name: &str) -> Option<&'static BeliefKind> {
     kinds.find(|kind| kind.name == name || kind.label == name)
 }
 
-/// Finds a kind as [`named`] does, but only among the kinds on which the choice of options can be learned.
+/// Finds a kind like [`named`], but only among the kinds of belief on which a DQN can learn to choose options.
 ///
-/// Frames correct such a belief. The belief either knows the model or was learned, but not both. Its learner does not
-/// also learn which objective to plan for.
+/// Such a belief is corrected by frames, and it either knows the model or is learned, but not both. Kinds whose learner
+/// already learns which objective to plan for are excluded.
 ///
 /// # Errors
 /// If there is no such kind. The error lists the labels of all valid kinds.

@@ -396,7 +396,8 @@ mod tests {
             let first = encode("tests", &contents).expect("small");
             let (_, read) = decode(&first).expect("whole");
             assert_eq!(read, contents);
-            // Each hash map has one of 24 random orders, so ten equal results in a row are no coincidence.
+            // safetensors iterates over a hash map in one of 24 random orders, so ten equal results in a row are no
+            // coincidence.
             for _ in 0..10 {
                 assert!(encode("tests", &contents).expect("small") == first);
             }
@@ -414,7 +415,7 @@ mod tests {
             read.map_err(|error| format!("{error:#}"))
         };
         let check = |bytes: &[u8], what: String| match read(bytes) {
-            // A change in the header's padding has no effect.
+            // The file stays readable if only the header's padding changes.
             Ok(got) => assert!(bytes.len() == whole.len() && got == contents(), "{what}"),
             Err(error) => assert!(
                 error.contains("checkpoint.safetensors: ") && error.contains("expected"),

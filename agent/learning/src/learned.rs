@@ -1,4 +1,4 @@
-//! Learned values: the contents of checkpoints, at most one value of each type.
+//! Learned values, loaded from checkpoints: at most one value of each type.
 
 use std::any::Any;
 use std::fmt::Debug;

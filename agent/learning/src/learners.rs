@@ -1,5 +1,5 @@
-//! Learners: agents that learn while they act. The command `train` runs them. They perform no I/O: frames go in, paths
-//! come out.
+//! Learners: agents that learn while they act. The command `train` runs them. They perform no I/O: they receive frames
+//! and return paths.
 //!
 //! Each kind of learner is a constant in its own file, and has an entry in [`LEARNERS`].
 

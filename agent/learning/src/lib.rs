@@ -1,6 +1,6 @@
 //! Learning agents: estimators with networks, learners, decisions, their checkpoints, and policies, which combine a
 //! belief, a planner and a goal. Only checkpoints and cached first beliefs use files. Everything else performs no I/O:
-//! frames go in, paths come out.
+//! it receives frames and returns paths.
 //!
 //! Each module uses only the modules below it in this list:
 //!
@@ -10,8 +10,8 @@
 //! - [`rollout`] -- an agent with its world, and the step that all commands share
 //! - [`policy`] -- policies by name, and their parts: belief, planner and goal
 //! - [`beliefs`] -- kinds of belief: constructors, names and properties, learned models
-//! - [`learned`] -- the contents of checkpoints, by type
-//! - [`gradient`], [`replay`], [`reward`], [`checkpoint`] -- the parts of learners
+//! - [`learned`] -- the values loaded from checkpoints, by type
+//! - [`gradient`], [`replay`], [`reward`], [`checkpoint`] -- the building blocks of learners
 //! - [`config`] -- settings
 //! - [`mod@file`] -- files that are written completely or not at all
 //! - [`parallel`] -- parallel computation for several worlds

@@ -153,7 +153,8 @@ impl Planned {
         &self.proposals
     }
 
-    /// Records the flown option, and returns the intent to publish to observers.
+    /// Records the flown option. Returns the policy, estimator and objective behind the path, as they are published to
+    /// observers.
     pub fn intent(&mut self, flown: Option<usize>) -> Intent {
         if let Some(proposal) = flown.and_then(|index| self.proposals.get(index)) {
             self.agent

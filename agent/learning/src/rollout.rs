@@ -1,5 +1,5 @@
-//! An agent with its world, and the step that all commands share: plan, fly, see, predict. All communication is behind
-//! [`Environment`].
+//! An agent with its world, and the step that all commands share: plan, fly, see, predict. All communication happens in
+//! implementations of [`Environment`].
 
 pub mod agent;
 pub mod building;

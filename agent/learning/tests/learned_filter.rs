@@ -1,4 +1,5 @@
-//! Compares the learned filter with the known-model filter, with finite differences and with itself.
+//! Tests of the learned filter: equality with the known-model filter, gradients against finite differences, and
+//! training.
 
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};

@@ -1,4 +1,4 @@
-//! Learns kernels that see the cell's own state, from frames of a model with such kernels.
+//! Learns kernels that depend on the cell's own state, from frames of a model with such kernels.
 
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};

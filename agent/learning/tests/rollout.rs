@@ -119,7 +119,8 @@ fn the_first_robot_of_a_team_flies_as_it_would_alone() {
         let mut team = robot(policy, &CELLS);
         let (own, of_team) = (alone.plan(), team.plan());
         assert_eq!((own.len(), of_team.len()), (1, 3), "{policy}");
-        // The beliefs are equal, so the team's agent plans the same path for its first robot alone.
+        // Both agents have the same belief, so the team's agent finds the same path if it plans for its first robot
+        // only.
         let first = team.agent.plan(&CELLS[..1], team.step());
         assert_eq!(own, first, "{policy}");
     }

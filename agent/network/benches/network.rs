@@ -61,7 +61,7 @@ fn network() -> Autoencoder {
     Autoencoder::new(settings, shape, 1, &Device::Cpu).expect("a network")
 }
 
-/// Returns a network after some updates, because the first ones allocate memory, which the process keeps.
+/// Returns a network after some updates, because the first updates allocate memory that the process then keeps.
 fn warm_network(window: &Window) -> Autoencoder {
     let mut network = network();
     for _ in 0..5 {
@@ -138,8 +138,8 @@ fn flight_frame(step: u64) -> Frame {
     frame
 }
 
-/// Measures the neural belief as in training. An update uses 16 of the 64 lessons (`neural.batch`). These fill a batch,
-/// because long flights need crops of the whole grid.
+/// Measures the neural belief as in training. An update uses 16 of the 64 lessons (`neural.batch`). These 16 lessons
+/// fill a batch, because long flights need crops of the whole grid.
 fn neural_belief(c: &mut Criterion) {
     let mut network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
     let (mut before, mut lessons) = (Sightings::new(shape()), Vec::new());

@@ -7,9 +7,9 @@ use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
 use serde::{Deserialize, Serialize};
 
-/// A constant that is added to moments and subtracted again. If gradients stay zero, moments then stop decaying at a
-/// few rounding errors of this constant. They never become subnormal numbers, which some processors handle a hundred
-/// times more slowly.
+/// A constant that is added to moments and subtracted again. Because of rounding, moments whose gradients stay zero
+/// then stop decaying at a few rounding errors of this constant. Moments therefore never become subnormal numbers,
+/// which some processors handle a hundred times more slowly.
 const FLUSH: f64 = 1e-30;
 
 /// Settings of Adam.
@@ -94,7 +94,7 @@ impl Adam {
         changes.extend(self.changes(settings, &gradients)?);
         let after = changes.iter();
         let after = after.map(|(name, _, tensor)| (format!("{prefix}{name}"), tensor));
-        // In the order of computation, so that the error names the cause.
+        // List tensors in the order of computation, so that the error names the first one that is not finite.
         let all = named(&groups).chain(of_variables);
         let all: Vec<_> = all.chain([("loss".into(), loss)]).chain(after).collect();
         let loss = self.checked(&all, loss)?;

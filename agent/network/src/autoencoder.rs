@@ -1,4 +1,5 @@
-//! The network with its optimiser. It computes predictors from frames, and learns from windows of frames.
+//! The dynamic autoencoder with its optimiser, which computes predictors from frames, and learns from windows of
+//! frames.
 
 use crate::adam::{Adam, AdamSettings};
 use crate::batch_norm::moved_statistics;
@@ -26,7 +27,7 @@ pub struct AutoencoderSettings {
     pub encoding: usize,
     /// Length of the hidden vector h.
     pub hidden: usize,
-    /// Number of frames in a training window. All but the first are predicted.
+    /// Number of frames in a training window. All frames but the first are predicted.
     pub window: usize,
     /// Capacity of the replay buffer, in frames.
     pub replay: usize,
@@ -35,7 +36,7 @@ pub struct AutoencoderSettings {
 }
 
 impl AutoencoderSettings {
-    /// Returns the settings that the authors used for their table.
+    /// Returns the settings that the authors used for the results in their table.
     pub fn paper() -> Self {
         Self {
             encoding: 4,
@@ -126,7 +127,7 @@ impl Autoencoder {
         Ok(numbers_of(&self.network.observation_matrix()?)?)
     }
 
-    /// Draws `h_0 ~ N(0, I)` for a run. It depends only on the seed.
+    /// Draws `h_0 ~ N(0, I)` for a run. The vector depends only on the seed.
     pub fn first_hidden(&self) -> Vec<f32> {
         self.draw_hidden(u64::MAX)
     }

@@ -1,4 +1,4 @@
-//! Batch normalisation, with moments of the window in training and running statistics otherwise.
+//! Batch normalisation, which uses the moments of the window in training, and running statistics otherwise.
 
 use crate::ops::norm::{EPSILON, Moments};
 use crate::pass::{KeptMoments, Pass};
@@ -7,7 +7,7 @@ use crate::variables::Variables;
 use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
-/// Weight of a new window in the running statistics, as in PyTorch.
+/// Weight of a new window in the moving averages of the running statistics, as in PyTorch.
 const MOMENTUM: f64 = 0.1;
 
 /// The parameters and running statistics of one normalisation.

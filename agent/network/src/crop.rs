@@ -3,8 +3,8 @@
 use crate::unet::ALIGNMENT;
 use emberwatch_model::grid::Shape;
 
-/// Sum of the margins on both sides of the cells to predict, in cells. Cells farther away hardly affect the
-/// predictions.
+/// Total width of the two margins on opposite sides of the cells to predict, in cells. Cells farther away hardly affect
+/// the predictions.
 const MARGINS: usize = 24;
 
 /// A rectangular part of a grid, with sides that are multiples of [`ALIGNMENT`]. It may extend beyond the grid's lower
@@ -48,7 +48,7 @@ impl Crop {
             let middle = (extent[axis][0] + extent[axis][1]).div_ceil(2);
             let max_first = whole.sides[axis] - sides[axis];
             let first = middle.saturating_sub(sides[axis] / 2).min(max_first);
-            // Align, so that strides sample the same cells as on the whole grid.
+            // Align the crop, so that convolutions with strides sample the same cells as on the whole grid.
             first / ALIGNMENT * ALIGNMENT
         });
         Self { first, sides }

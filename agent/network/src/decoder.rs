@@ -1,5 +1,5 @@
-//! `Decoder(h)` of paper eq. 9. It doubles the sides of a seed of a few cells four times, with Dropout2d, normalisation
-//! and ReLU in between.
+//! `Decoder(h)` of paper eq. 9. It starts from a seed of a few cells and doubles its sides four times, with Dropout2d,
+//! normalisation and ReLU in between.
 
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
@@ -27,8 +27,8 @@ const KERNEL: usize = 4;
 /// The decoder, from hidden vectors to logits of states.
 #[derive(Debug)]
 pub struct Decoder {
-    /// The weights `[hidden, channels, rows, cols]` of a transposed convolution, which is a matrix product if applied
-    /// to a single cell.
+    /// The weights `[hidden, channels, rows, cols]` of a transposed convolution. Applied to a single cell, this
+    /// convolution is a matrix product.
     seed: Tensor,
     levels: Vec<Level>,
     operators: Operators,
@@ -93,7 +93,7 @@ impl Decoder {
         }
     }
 
-    /// Computes the loss of the predictions from hidden vectors at the window's targets (eqs. 8 and 11).
+    /// Computes the loss at the window's targets (eqs. 8 and 11) if these are predicted from hidden vectors.
     pub fn loss(
         &self,
         hidden: &Tensor,
@@ -107,8 +107,8 @@ impl Decoder {
         }
     }
 
-    /// Computes the loss and its gradients together. This is possible because the loss is a scalar, and it avoids a
-    /// tensor of logits.
+    /// Computes the loss and its gradients together. This avoids a tensor of logits, and is possible because the loss
+    /// is a scalar.
     fn own_loss(&self, z: &Tensor, observation: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let all = Mask::all(pass.window.len(), self.n_states()?);
         let layers = self.layers(pass, &all)?;

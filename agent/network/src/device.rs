@@ -23,7 +23,7 @@ pub enum DeviceKind {
 pub struct DeviceError(String);
 
 impl DeviceKind {
-    /// Opens the first device of the kind.
+    /// Opens the first device of this kind.
     ///
     /// # Errors
     /// [`DeviceError`] if this program has no support for the device, or the device cannot be opened.

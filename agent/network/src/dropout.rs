@@ -17,7 +17,8 @@ pub struct Mask {
     /// The factor of each frame and channel: `scale`, or 0 for a dropped channel.
     scales: Arc<[f32]>,
     kept: Arc<[usize]>,
-    /// The index in `kept` at which each frame's channels start, and the end of the last frame's channels.
+    /// For each frame, the index in `kept` at which its channels start, followed by the end of the last frame's
+    /// channels.
     starts: Arc<[usize]>,
 }
 

@@ -58,7 +58,7 @@ impl Encoder {
         }
     }
 
-    /// Computes the flattened features `[frames, features]` with candle's operators. Maps are
+    /// Computes the flattened features `[frames, features]` with candle's operators. Feature maps have the shape
     /// `[frames, channels, rows, cols]`.
     fn stock(&self, pass: &Pass<'_>) -> Result<Tensor> {
         let first = &self.stages[0];
@@ -141,7 +141,7 @@ impl Encoder {
     }
 }
 
-/// Creates the layer of a convolution with `weight [channels out, channels in, rows, cols]`.
+/// Creates a layer from a convolution's `weight [channels out, channels in, rows, cols]`.
 fn layer<'a>(
     sizes: Sizes,
     weight: &Tensor,

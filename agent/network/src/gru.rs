@@ -1,4 +1,4 @@
-//! The recurrence of paper eq. 9 over a window.
+//! The recurrence of paper eq. 9, a GRU that runs over the frames of a window.
 
 use crate::operators::Operators;
 use crate::ops::gru_sequence::gru_sequence;
@@ -54,7 +54,7 @@ impl Gru {
         }
     }
 
-    /// Computes the sequence on the CPU, with one copy in each direction.
+    /// Computes the sequence on the CPU, with one copy to the CPU and one copy back.
     fn through_the_cpu(&self, inputs: &Tensor, first: &[f32]) -> Result<Tensor> {
         let all = [inputs, &self.w_hh, &self.b_hh];
         let flat = all.map(|tensor| tensor.flatten_all());

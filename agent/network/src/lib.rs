@@ -10,7 +10,7 @@
 //! kernels and gradients (`ops`), and candle's stock operators, which also run on GPUs.
 //!
 //! To add a layer, create it in `Network::new` and call it in `Network::forward`. `examples/second_gru.rs` shows how to
-//! add one outside this crate.
+//! add a layer outside this crate.
 
 mod adam;
 mod autoencoder;

@@ -72,8 +72,9 @@ mod tests {
 
     #[test]
     fn all_parameters_and_statistics_are_counted() {
-        // Convolutions 6,176 + 8,208 + 1,160, linear 516, GRU 120, decoder 8,192 + 131,072 + 32,768 + 8,192 + 768,
-        // observation matrix 9, and four numbers for each of the 296 channels of the seven normalisations.
+        // The convolutions have 6,176 + 8,208 + 1,160 numbers, the linear layer 516, the GRU 120, the decoder 8,192 +
+        // 131,072 + 32,768 + 8,192 + 768, the observation matrix 9, and the seven normalisations four for each of their
+        // 296 channels.
         assert_eq!(shape(64).n_numbers(), 197_181 + 4 * 296);
         assert!(shape(4096).n_numbers() > 40_000_000);
     }

@@ -37,7 +37,8 @@ const BATCH_CELLS: usize = 65_536;
 /// Maximum number of cells in one pass of predictions with candle's operators: 64 grids of 64 x 64.
 const PASS_CELLS: usize = 262_144;
 
-/// The sightings of a world, and the prediction of the filter that the network corrects, `[O, H, W]`, if there is one.
+/// The sightings of a world, and, if the network corrects the predictions of a filter, the filter's prediction,
+/// `[O, H, W]`.
 pub type Seen<'a> = (&'a Sightings, Option<&'a Probabilities>);
 
 /// The network, its variables and its optimiser. Clones share the variables, so an update of one clone changes all.
@@ -56,10 +57,10 @@ pub struct NeuralBelief {
 pub struct Lesson {
     /// The sightings before the frame.
     pub before: Sightings,
-    /// The row-major index and the value of each observed cell, at least one.
+    /// The row-major index and the value of each observed cell, for at least one cell.
     pub frame: Vec<(usize, u8)>,
-    /// The prediction for these cells, `[cells, O]`, by the filter that the network corrects. Empty if there is no such
-    /// filter.
+    /// The prediction for the observed cells, `[cells, O]`, by the filter that the network corrects. Empty if the
+    /// network corrects no filter.
     pub base: Vec<f32>,
 }
 
@@ -90,7 +91,7 @@ impl NeuralBelief {
         })
     }
 
-    /// Returns an identifier that only clones share.
+    /// Returns an identifier that is the same only for clones of one network.
     pub fn id(&self) -> usize {
         Arc::as_ptr(&self.unet).addr()
     }
@@ -129,7 +130,7 @@ impl NeuralBelief {
     }
 
     /// Predicts the distribution of each cell's observation in the current step, `[O, H, W]`. `base` is the prediction
-    /// of the filter that the network corrects, if there is one.
+    /// of the filter that the network corrects, if it corrects one.
     ///
     /// # Errors
     /// If a value is not finite, or the device fails.
@@ -202,7 +203,7 @@ impl NeuralBelief {
     }
 
     /// Computes the mean cross-entropy over the observed cells of lessons, which must have the same grid (paper eqs. 8
-    /// and 11). The network reads crops around these cells. Lessons beyond the size of a batch are ignored.
+    /// and 11). The network reads crops around the observed cells. Lessons beyond the size of a batch are ignored.
     ///
     /// # Panics
     /// If there is no lesson, if a lesson has no cells, or if only some lessons have a base.
@@ -260,8 +261,8 @@ impl NeuralBelief {
         log_p.mean_all()?.neg()
     }
 
-    /// Computes the same loss as a weighted sum over all cells, without gather or scatter. Unobserved cells have weight
-    /// 0.
+    /// Computes the same loss as `loss_at`, but as a weighted sum over all cells, without gather or scatter. Unobserved
+    /// cells have weight 0.
     fn loss_of_all(
         &self,
         images: &Tensor,

@@ -9,7 +9,7 @@ use candle_nn::{Init, VarBuilder};
 /// The learned observation matrix `P(y | x)`.
 #[derive(Debug)]
 pub struct ObservationMatrix {
-    /// The logits, `[observations, states]`. The softmax runs over each column.
+    /// The logits, `[observations, states]`. The softmax of each column is a column of `O`.
     weight: Tensor,
 }
 
@@ -36,7 +36,7 @@ impl ObservationMatrix {
         let q = u.reshape(((), matrix.dim(1)?))?.matmul(&matrix.t()?)?;
         let [hits, misses] = weights(logits, window, &q)?;
         let hit = (hits * (&q + LOG_FLOOR)?.log()?)?;
-        // Rounding can make q larger than 1.
+        // Rounding can make q larger than 1, so limit 1 - q to at least 0.
         let miss = (misses * ((1.0 - &q)?.relu()? + LOG_FLOOR)?.log()?)?;
         (hit + miss)?.sum_all()
     }

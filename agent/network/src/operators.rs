@@ -9,9 +9,9 @@ pub enum Operators {
     Own,
     /// Candle's operators, for any device and any floats.
     ///
-    /// They suit devices on which copies to the host and scatter operations are slow. Losses are weighted sums over all
-    /// cells, and an update copies only a few numbers back. Only the recurrence runs on the CPU, because on a GPU each
-    /// of its thousand small steps would take a dozen kernel launches.
+    /// They suit devices on which copies to the host and scatter operations are slow: losses are weighted sums over all
+    /// cells, and an update copies only a few numbers to the host. Only the recurrence runs on the CPU, because on a
+    /// GPU each of its thousand small steps would take a dozen kernel launches.
     Stock,
 }
 

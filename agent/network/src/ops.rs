@@ -3,11 +3,11 @@
 //! Each layer also has an implementation with candle's operators, which runs on other devices and number types. Tests
 //! compare the two implementations.
 //!
-//! - [`conv`]: the arithmetic of plain and transposed convolutions, one frame at a time, on the matrix [`product`]s.
-//! - [`image_conv`], [`doubled_sum`]: the U-Net's operators: a convolution with bias, ReLU and residual, and
-//!   upsampling.
-//! - [`chain`]: the autoencoder's encoder and decoder, sequences of convolutions ([`stage`]) with dropout,
-//!   normalisation ([`norm`]) and ReLU ([`activation`]) between them. [`cell_loss`]: the loss at visited cells.
+//! - [`conv`]: the arithmetic of plain and transposed convolutions, one frame at a time, by matrix [`product`]s.
+//! - [`image_conv`], [`doubled_sum`]: the U-Net's convolution with bias, ReLU and residual, and its upsampling.
+//! - [`chain`]: the autoencoder's encoder and decoder, which are sequences of convolutions ([`stage`]) with dropout,
+//!   normalisation ([`norm`]) and ReLU ([`activation`]) between them.
+//! - [`cell_loss`]: the loss at visited cells.
 //! - [`gru_sequence`]: a GRU over a sequence.
 
 pub(crate) mod activation;

@@ -7,8 +7,8 @@ use std::cell::RefCell;
 
 /// One pass over a window of frames, for training with dropout or for inference without.
 ///
-/// In training, normalisations use the moments of the window, and store them here. In inference, they use the running
-/// statistics.
+/// In training, normalisations use the moments of the window, and store these moments in the pass. In inference, they
+/// use the running statistics.
 #[derive(Debug)]
 pub struct Pass<'a> {
     /// The frames.
@@ -51,7 +51,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// Creates the pass for an estimator, with running statistics and without dropout.
+    /// Creates the pass for inference, with running statistics and without dropout.
     pub fn inference(window: &'a Window) -> Self {
         Self {
             window,

@@ -12,7 +12,7 @@ use std::ops::Range;
 pub struct FrameReplay {
     capacity: usize,
     frames: VecDeque<Frame>,
-    /// Number of frames that were ever added.
+    /// Number of frames added so far, including removed frames.
     n_pushed: u64,
     /// For each track except the oldest, the number of its first frame, counted from the first frame ever added.
     begins: VecDeque<u64>,

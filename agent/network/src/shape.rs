@@ -5,8 +5,8 @@
 //!
 //! - The decoder doubles a seed of `ceil(H / 16) x ceil(W / 16)` cells four times (4 x 4 cells for 64 x 64). The result
 //!   beyond the grid's lower and right edges is cut off.
-//! - The encoder reads a grid of that padded size, without observations beyond the edges. Kernels are reduced to the
-//!   size of their input.
+//! - The encoder reads a grid of the size that the decoder produces, without observations beyond the original edges.
+//!   Kernels larger than their input are reduced to its size.
 
 use emberwatch_model::grid::Shape;
 
@@ -19,7 +19,7 @@ pub const DECODER_CHANNELS: [usize; 4] = [128, 64, 32, 16];
 /// Kernel side and stride of the encoder's convolutions.
 const ENCODER_KERNELS: [(usize, usize); 3] = [(8, 4), (4, 2), (3, 1)];
 
-/// Side of a seed cell in cells of the padded grid, after four doublings.
+/// Number of rows (and of columns) of the padded grid that one seed cell becomes after four doublings.
 const SEED_CELL: usize = 16;
 
 /// The sizes that determine all tensor shapes.

@@ -1,8 +1,9 @@
 //! A small U-Net, which maps the features of cells to the logits of their next observations.
 //!
-//! Images are `[batch, channels, rows, cols]`, with sides that are multiples of [`ALIGNMENT`]. Two convolutions with
-//! stride 2 halve the image. Nearest-neighbour upsampling with skip connections doubles it again. There are residual
-//! layers and no normalisation. The head starts at zero, so all observations are equally probable at first.
+//! Images are `[batch, channels, rows, cols]`, with sides that are multiples of [`ALIGNMENT`]. Each of two convolutions
+//! with stride 2 halves the image's sides. Nearest-neighbour upsampling with skip connections doubles them again. There
+//! are residual layers and no normalisation. The weights of the last layer start at zero, so all observations are
+//! equally probable at first.
 
 use crate::operators::Operators;
 use crate::ops::doubled_sum::DoubledSum;
@@ -17,7 +18,7 @@ pub const ALIGNMENT: usize = 4;
 /// Number of channels at full, half and quarter size.
 const CHANNELS: [usize; 3] = [16, 24, 32];
 
-/// Number of cells in a 3 x 3 patch. The cells are in the order of a kernel's taps.
+/// Number of cells in a 3 x 3 patch. The cells are in the order of a kernel's weights.
 const AROUND: usize = 9;
 
 /// The network, from features of cells to logits of observations.
@@ -129,8 +130,8 @@ impl UNet {
             return small.apply_op2(large, DoubledSum);
         }
         let (batch, channels, rows, cols) = small.dims4()?;
-        // Candle limits the gradient of `upsample_nearest2d` to whole batches with one stride, and its gradient of
-        // `index_select` uses only one GPU thread per channel.
+        // Use broadcasts: candle limits the gradient of `upsample_nearest2d` to whole batches with one stride, and its
+        // gradient of `index_select` uses only one GPU thread per channel.
         let x = small.reshape((batch * channels, rows, 1, cols))?;
         let x = x.broadcast_as((batch * channels, rows, 2, cols))?;
         let x = x.reshape((batch * channels * 2 * rows, cols, 1))?;

@@ -141,7 +141,7 @@ struct Counting(Arc<AtomicUsize>);
 impl SimpleBackend for Counting {
     fn get(&self, s: Shape, _: &str, _: Init, dtype: DType, device: &Device) -> Result<Tensor> {
         self.0.fetch_add(s.elem_count(), Ordering::Relaxed);
-        // A single number with a broadcast shape.
+        // Allocate a single number and broadcast it to the shape.
         Tensor::zeros((), dtype, device)?.broadcast_as(s)
     }
 

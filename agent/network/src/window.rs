@@ -17,7 +17,7 @@ pub(crate) struct Visit {
 #[derive(Debug, Clone)]
 pub struct Window {
     visits: Arc<[Visit]>,
-    /// The index at which each frame's visits start, and the end of the last frame's visits.
+    /// For each frame, the index at which its visits start, followed by the end of the last frame's visits.
     starts: Arc<[usize]>,
 }
 
@@ -71,7 +71,7 @@ impl Window {
         }
     }
 
-    /// Returns the cells to predict after all frames. Each is one term of the loss.
+    /// Returns the cells to predict after all frames. Each cell is one term of the loss.
     pub(crate) fn all_targets(&self) -> &[Visit] {
         &self.visits[self.starts[1.min(self.len())]..]
     }
@@ -81,7 +81,7 @@ impl Window {
         !self.all_targets().is_empty()
     }
 
-    /// Returns whether all cells and observations exist in the network.
+    /// Returns whether the network has all cells and observations of the window.
     pub(crate) fn fits(&self, shape: &NetworkShape) -> bool {
         let (height, width) = shape.grid.dim();
         self.visits.iter().all(|visit| {

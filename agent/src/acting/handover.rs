@@ -12,8 +12,9 @@ use emberwatch_protocol::message::Status;
 /// Number of frames to recall before the lease is renewed. Recalling them takes much less time than any lease lasts.
 const RENEW_AFTER: u64 = 500;
 
-/// Restores an agent's belief from what the server keeps. Returns true if the belief already includes the present
-/// frame, so that it describes X_{k+1}. `number` is the server's number of the agent's first robot.
+/// Restores an agent's belief from the belief or the frames that the server keeps. Returns true if the belief already
+/// includes the present frame, so that it describes X_{k+1}. `number` is the server's number of the agent's first
+/// robot.
 pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result<bool> {
     if take_over_left(client, number, rollout)? {
         return Ok(true);
@@ -43,7 +44,8 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
     Ok(false)
 }
 
-/// Updates the belief of an agent that missed steps, up to and including the present frame, to the posterior.
+/// Updates the belief of an agent that missed steps with the missed frames and the present frame. The belief is then
+/// the posterior.
 pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: Seen) -> Result<()> {
     let missed = rollout.step() + 1..seen.observation.world.step;
     if rollout.agent.policy().belief.input == Input::Frames {
@@ -57,7 +59,7 @@ pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: S
     Ok(())
 }
 
-/// Updates an agent's belief with the frame of an earlier step. Returns false if the server has not kept it.
+/// Updates an agent's belief with the frame of an earlier step. Returns false if the server has not kept the frame.
 fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) -> Result<bool> {
     let Ok(seen) = client.recall(number..number + 1, step) else {
         return Ok(false);
@@ -94,7 +96,8 @@ pub fn take_over_left(
     Ok(is_taken)
 }
 
-/// Leaves an agent's belief for the robot's next agent. The belief is about X_{k+1}, after the last observation.
+/// Leaves an agent's belief for the robot's next agent. The belief is a prediction of X_{k+1} that includes the last
+/// observation.
 pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), ConnectionError> {
     let present = rollout.observation().world;
     let agent = &rollout.agent;
@@ -102,7 +105,7 @@ pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), 
         return Ok(());
     };
     match leave_belief(client, number, &present, &kind, &bytes) {
-        // The server keeps no beliefs, or none of this length.
+        // The server keeps no beliefs, or the belief is too long for it.
         Err(ConnectionError::Refused {
             status: Status::Malformed,
             message,

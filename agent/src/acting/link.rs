@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub struct Link {
     pub client: Client,
     truth: Option<TruthFeed>,
-    /// Numbers of the robots that the agent plans for, including the client's.
+    /// Numbers of the robots that the agent plans for, including the robots that the client holds.
     robots: Range<u32>,
 }
 

@@ -23,12 +23,12 @@ pub struct Mission {
     /// The task that the server must run, with its model unless the task is recorded. `None` accepts any worlds.
     pub task: Option<(Task, Option<Model>)>,
     pub world: u32,
-    /// Numbers of the robots to fly in the world, on one belief.
+    /// Numbers of the robots to fly in the world. They share one belief.
     pub robots: Range<u32>,
     /// How the agent cooperates with the other robots of the world.
     pub cooperation: Cooperation,
     pub policy: String,
-    /// Steps to act for; 0: until stopped.
+    /// Number of steps to act; 0: until stopped.
     pub steps: u64,
     /// Minimum time from the start of one step to the start of the next. A request to stop waits until it has passed.
     pub shortest_step: Duration,
@@ -141,7 +141,7 @@ pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     model.map(|model| model.with_radius(radius)).transpose()
 }
 
-/// Returns the error text for a policy that filters with a model, on recorded worlds without one.
+/// Returns the error text for a policy whose filter needs a model, if none was given for recorded worlds.
 pub fn needs_model(policy: &Policy) -> String {
     format!(
         "policy {:?} filters with a model, and recorded worlds have none: give --model FILE, or choose a policy \

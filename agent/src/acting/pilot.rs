@@ -28,7 +28,7 @@ use std::time::{Duration, Instant};
 /// Minimum time between two warnings about missed steps.
 const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
-/// An agent that holds robots of one world.
+/// An agent that holds the lease on robots of one world.
 pub struct Pilot {
     link: Link,
     flyer: Flyer,
@@ -47,7 +47,7 @@ struct Flyer {
     robots: Range<u32>,
     /// Numbers on the server of the robots that it flies.
     own: Range<u32>,
-    /// Robots of each world.
+    /// Number of robots per world.
     team: u32,
     /// Time that the last plan took to compute.
     planning: Duration,
@@ -69,7 +69,8 @@ impl Pilot {
         let policy = Policy::named(&mission.policy, &model)?;
         // An agent that cannot act must not take robots over from an agent that can.
         check(mission, &info, (&model, &policy), is_recorded)?;
-        // Simulating the prior can take long, so it precedes the lease. It is skipped if a former agent left a belief.
+        // Simulating the prior can take long, so it happens before the lease begins. The simulation is skipped if a
+        // former agent left a belief.
         if let Some(of_belief) = policy.belief.handover
             && is_belief_left(
                 &mission.instance,
@@ -91,7 +92,8 @@ impl Pilot {
         Ok(attached)
     }
 
-    /// Acquires the robots and takes over the belief left for the first one. Returns `None` if the belief is outdated.
+    /// Acquires the robots and takes over the belief left for the first robot. Returns `None` if the belief is
+    /// outdated.
     fn continue_left(
         mission: &Mission,
         info: &ServerInfo,
@@ -210,7 +212,7 @@ impl Pilot {
         numbers.try_for_each(|number| leave(&mut self.link.client, number, &self.flyer.rollout))
     }
 
-    /// Releases the robots. Returns when observers have had time to see the last belief.
+    /// Releases the robots. Returns only after observers have had time to see the last belief.
     pub fn release(self) -> Result<(), ConnectionError> {
         let released = self.link.client.release();
         self.flyer.feed.end();

@@ -19,7 +19,8 @@ pub struct Summary {
     pub reward: f64,
 }
 
-/// Acts in successive episodes until the steps are done or `stop` is set. If the server ends, waits for a new server.
+/// Acts in successive episodes until the mission's steps are done or `stop` is set. If the server stops, waits for a
+/// new server.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut pilot = Pilot::attach(mission)?;
@@ -92,7 +93,7 @@ fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Pilot>> {
     while !stop.load(Ordering::Relaxed) {
         match Pilot::attach(&mission) {
             Ok(pilot) => return Ok(Some(pilot)),
-            // The server only paused: this process's former connection still holds the robots.
+            // The server had only paused, so this process's former connection still holds the robots.
             Err(error) if is_own_lease(&error) && !mission.takeover => mission.takeover = true,
             Err(error) if is_outage(&error) => {
                 mission.takeover = false;

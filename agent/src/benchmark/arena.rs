@@ -30,7 +30,7 @@ pub const MAX_BATCH: u32 = 32;
 /// Time to live of an unused lease on a comparison's worlds.
 const LEASE: Duration = Duration::from_secs(3600);
 
-/// Worlds of one server, held for a comparison.
+/// Worlds of one server, leased for a comparison.
 pub struct Arena {
     instance: Instance,
     client: Client,
@@ -65,7 +65,8 @@ impl Arena {
         let claim = Claim {
             robots: 0..(used + u32::from(spare.is_some())) * team,
             takeover: false,
-            // Long, because simulating the prior can take long. Closing the connection still ends the lease at once.
+            // The time to live is long, because simulating the prior can take long. Closing the connection still ends
+            // the lease at once.
             time_to_live: Some(LEASE),
         };
         let client = Client::acquire(connection, &claim)?;
@@ -245,7 +246,7 @@ impl Arena {
         building::agent(policy, config, &conditions, self.info().n_moves, seed)
     }
 
-    /// Returns an error if the worlds have no model and the policy filters with one.
+    /// Returns an error if the policy's filter needs a model and the worlds have none.
     pub fn check_model(&self, policy: &Policy) -> Result<()> {
         ensure!(
             !(self.lacks_model() && policy.belief.knows_model),

@@ -89,7 +89,7 @@ pub fn compare(
         prior: &prior,
         seeds,
     };
-    // Refuse a policy that cannot run before other policies run for hours.
+    // Before other policies run for hours, refuse any policy that cannot run.
     for contestant in &contestants {
         let checked = game(contestant, &seeds[..1]).check(arena);
         checked.with_context(|| format!("policy {:?}", contestant.policy.name))?;
@@ -324,7 +324,7 @@ impl Players<'_> {
         }
     }
 
-    /// Publishes the posterior of each agent whose view is due.
+    /// Publishes the posterior of each agent that is due to be shown to observers.
     fn show(&mut self) {
         let (n_agents, n_robots) = (self.n_agents(), self.n_robots as u32);
         let crew = n_robots / n_agents as u32;

@@ -1,4 +1,5 @@
-//! Scores how well learned beliefs predict observations, compared with the known model and with class frequencies.
+//! Scores how well learned beliefs predict observations, compared with the known model and with the frequencies of the
+//! observation values.
 //!
 //! All beliefs receive the same frames, from the paths of a guide: a random walk, or beam search with the known model.
 //! The score is each frame's log-likelihood per visited cell, under the prediction made before the frame.

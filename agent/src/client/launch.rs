@@ -1,4 +1,4 @@
-//! Finds, starts, awaits and always stops servers and dashboards as child processes.
+//! Finds and starts servers and dashboards as child processes, waits until they answer, and always stops them.
 
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_protocol::channels::Instance;
@@ -36,7 +36,7 @@ struct OwnProgram(Child);
 
 impl OwnServer {
     /// Starts `emberwatch-server` with the given arguments on a private instance, and waits until it answers. The
-    /// server ends with this process, even if this process is killed.
+    /// server never outlives this process, even if this process is killed.
     pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self> {
         // The process id alone is not unique: a process in another container may share /dev/shm.
         let random = RandomState::new().hash_one(0);
@@ -83,8 +83,8 @@ impl OwnServer {
 }
 
 impl OwnDashboard {
-    /// Starts `emberwatch-dashboard` for an instance, with its page at `address`. The dashboard ends with this process,
-    /// even if this process is killed.
+    /// Starts `emberwatch-dashboard` for an instance, with its page at `address`. The dashboard never outlives this
+    /// process, even if this process is killed.
     pub fn start(instance: &Instance, address: SocketAddr) -> Result<Self> {
         let mut command = private(neighbour("emberwatch-dashboard"));
         let address = address.to_string();
@@ -156,12 +156,14 @@ impl Drop for OwnProgram {
     }
 }
 
-/// Returns the command of a program that ends with this process, and logs only warnings unless RUST_LOG is set.
+/// Returns the command for a program that exits when this process ends, and that logs only warnings unless RUST_LOG is
+/// set.
 fn private(program: PathBuf) -> Command {
     let mut command = Command::new(program);
     command
         .args(["--exit-with", &std::process::id().to_string()])
-        // A terminal's Ctrl-C must not reach the program, because this process still needs it while stopping.
+        // Ctrl-C in a terminal must not reach the program, because this process still needs the program while it shuts
+        // down.
         .process_group(0);
     if std::env::var_os("RUST_LOG").is_none() {
         command.env("RUST_LOG", "warn");

@@ -1,4 +1,4 @@
-//! The hidden states of a batch of worlds. They serve evaluation and oracles, never learning.
+//! The hidden states of a batch of worlds. They are used for evaluation and by oracles, never for learning.
 
 use anyhow::{Context, Result, bail};
 use emberwatch_protocol::channels::Instance;
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 /// How long the hidden states may take to arrive after their step.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// A reader of the channel `truth`, in step with a client that acts.
+/// A reader of the channel `truth` that keeps pace with a client that acts.
 pub struct TruthFeed {
     observer: Observer<TruthHeader>,
     shape: Shape,

@@ -5,7 +5,8 @@ use emberwatch_protocol::feed::View;
 use std::ops::Range;
 use std::time::Duration;
 
-/// Returns an agent's belief and intent after a step. `planning` is the time that planning took.
+/// Returns an agent's belief after a step, with the policy and objective behind its last path. `planning` is the time
+/// that planning took.
 pub fn view(rollout: &Rollout, world: u32, robots: Range<u32>, planning: Duration) -> View<'_> {
     View {
         world,

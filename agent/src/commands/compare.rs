@@ -179,7 +179,8 @@ impl CompareCommand {
         Ok(added)
     }
 
-    /// Checks the rows of `--add` before a comparison runs. Skips rows that belong to another number of `--robots`.
+    /// Checks the rows of `--add` before a comparison runs. Skips rows whose number of robots is another entry of
+    /// `--robots`.
     fn check_added(
         &self,
         added: &[PolicyRun],
@@ -209,7 +210,8 @@ impl CompareCommand {
         lock_csv(self.csv.as_deref())
     }
 
-    /// Returns the policies to run in an arena. If it has no model, the ladder keeps only policies that need none.
+    /// Returns the policies to run in an arena. If the arena has no model, the ladder keeps only policies that need
+    /// none.
     fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
         let mut policies = self.policies(arena.model(), learned)?;
         if arena.lacks_model() && self.policies.is_empty() && !self.has_teams() {
@@ -340,8 +342,8 @@ fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
     Ok(policy::options_table(decisions.belief, model))
 }
 
-/// Returns the ladder with learned policies inserted: the autoencoder's after the policies without a belief, all others
-/// after the known-model policies.
+/// Returns the ladder with learned policies inserted: the autoencoder's policies follow the policies without a belief,
+/// and all others follow the known-model policies.
 fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
     let of_learned = policy::of_learned(learned, model).into_iter();
     let (network, others): (Vec<_>, Vec<_>) =
@@ -374,7 +376,7 @@ pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Resu
     results
 }
 
-/// Draws a snapshot of a world with one robot. Worlds with several robots have none.
+/// Draws a snapshot of a world with one robot. Draws nothing if worlds have several robots.
 fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<()> {
     if arena.n_robots() > 1 {
         return Ok(());

@@ -21,7 +21,7 @@ use emberwatch_learning::policy::{self, Policy};
 use emberwatch_network::DeviceKind;
 use std::path::PathBuf;
 
-/// The policy with which rewards are compared, paired by world.
+/// The baseline for comparisons of rewards, which are paired by world.
 const BASELINE: &str = "beam_exploit";
 
 /// The policies that learned policies are compared with.

@@ -74,7 +74,7 @@ pub struct RunCommand {
 impl RunCommand {
     pub fn run(&self) -> Result<()> {
         let model = self.model.as_deref().map(model_named).transpose()?;
-        // Refuse a policy that no server can run before waiting for one.
+        // Before waiting for a server, refuse a policy that no server can run.
         match &model {
             Some(model) => Policy::named(&self.policy, model).map(drop),
             None => policy::check_name(&self.policy),
@@ -121,7 +121,8 @@ fn task_with_model(task: Task) -> Result<(Task, Option<Model>)> {
     Ok((task, model.transpose()?))
 }
 
-/// Parses a rate of at least 1: observers would take a slower agent for dead, and it would take longer to stop.
+/// Parses a rate of at least 1 step per second. Observers would take a slower agent for dead, and a slower agent would
+/// stop late.
 fn parse_rate(text: &str) -> Result<f64, String> {
     let rate: f64 = text.parse().unwrap_or(f64::NAN);
     if rate.is_finite() && rate >= 1.0 {

@@ -24,7 +24,7 @@ pub struct WaitFlag {
 }
 
 impl WaitFlag {
-    /// Waits for the instance's server. Returns false if `is_over` came first.
+    /// Waits for the instance's server. Returns false if `is_over` returned true first.
     pub fn for_server(&self, instance: &Instance, is_over: impl Fn() -> bool) -> Result<bool> {
         Ok(wait_for_server(instance, self.wait, is_over)?)
     }
@@ -102,7 +102,8 @@ pub fn make_folder(path: &Path) -> Result<()> {
         .with_context(|| format!("create {}: {expected}", path.display()))
 }
 
-/// Creates the folder of the `--csv` file and locks the file until it is written, so that errors come before the work.
+/// Creates the folder of the `--csv` file and locks the file until it is written, so that errors are found before the
+/// work begins.
 pub fn lock_csv(path: Option<&Path>) -> Result<Option<RunsFile>> {
     let lock = |path: &Path| {
         make_folder_of(path).with_context(|| path.display().to_string())?;

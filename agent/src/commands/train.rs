@@ -27,7 +27,7 @@ use std::time::{Duration, Instant};
 /// Default number of training worlds, except for a learner that follows a single world.
 pub(super) const N_WORLDS: u32 = 16;
 
-/// Values of `--coverage`: for each, whether frames show every cell, its name, and its help text.
+/// The values of `--coverage`. Each consists of whether frames show every cell, the value's name, and its help text.
 const COVERAGES: [(bool, &str, &str); 2] = [
     (false, "path", "The cells in sight of the path"),
     (
@@ -171,7 +171,8 @@ impl TrainCommand {
         })
     }
 
-    /// Reads the belief that decisions act on, or that a network corrects. Refuses flags that would be ignored.
+    /// Reads the belief that decisions are based on, or the filter that a network corrects. Refuses flags that would be
+    /// ignored.
     fn learned(
         &self,
         kind: &LearnerKind,
@@ -298,7 +299,7 @@ impl TrainCommand {
         Ok(())
     }
 
-    /// Returns the instance to train on, and the server if this call started it. Dropping it stops the server.
+    /// Returns the instance to train on, and the server if this call started it. Dropping the returned server stops it.
     fn server(&self, training: &TrainingSpec) -> Result<(Instance, Option<OwnServer>)> {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
@@ -330,7 +331,7 @@ impl TrainCommand {
     }
 }
 
-/// Starts a server for a training. Dropping it stops the server.
+/// Starts a server for a training. Dropping the returned value stops the server.
 pub(super) fn start_server(
     program: Option<PathBuf>,
     mut arguments: Vec<String>,
@@ -353,7 +354,7 @@ fn needs_belief(training: &TrainingSpec) -> Result<bool> {
     Ok(decides(training.learner()?) && training.belief()?.learned(&training.learned).is_err())
 }
 
-/// Trains the belief that decisions act on, unless its training is complete.
+/// Trains the belief that decisions are based on, unless its training is complete.
 fn learn_belief(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
     let Some(belief) = training.belief_training()? else {
         return Ok(());

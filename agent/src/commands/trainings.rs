@@ -1,8 +1,8 @@
 //! Trainings for the policies of a suite: finds their checkpoints, and runs missing trainings.
 //!
 //! `FOLDER/TASK` contains a folder for each training: `filter`, `neural` and `autoencoder` for beliefs, and
-//! `decisions-BELIEF` for decisions on a belief. A policy that lacks its folder uses the checkpoint that `train --out
-//! FOLDER/TASK` wrote.
+//! `decisions-BELIEF` for decisions on a belief. If a policy's folder is missing, the policy uses the checkpoint that
+//! `train --out FOLDER/TASK` wrote.
 
 use super::train::{N_WORLDS, learn, start_server};
 use crate::training::{CHECKPOINT, TrainingSpec, seconds};
@@ -29,9 +29,10 @@ pub struct Lesson {
     pub learned: Learned,
     /// Processor seconds of the policy's trainings; `None` if one of them has no record.
     pub seconds: Option<f64>,
-    /// Whether `suite --train` trains no further: the policy needs no checkpoint, or the user ran `train`.
+    /// Whether `suite --train` leaves the checkpoints as they are, because the policy needs none or the user ran
+    /// `train`.
     pub is_final: bool,
-    /// The learner of the last training and its world steps.
+    /// The last training: its learner, and its number of world steps.
     steps: Option<(&'static LearnerKind, u64)>,
 }
 
@@ -91,7 +92,8 @@ fn trainings(folder: &Path, policy: &Policy) -> impl Iterator<Item = (&'static s
     belief.into_iter().chain(decisions)
 }
 
-/// Reads the last training's checkpoint, which includes the first training's belief. Adds up all processor seconds.
+/// Reads the last training's checkpoint, which includes the first training's belief. Adds up the processor seconds of
+/// all trainings.
 fn read(folders: &[PathBuf]) -> Result<Lesson> {
     let seconds = folders.iter().map(|folder| seconds::read(folder));
     let seconds = seconds.collect::<Result<Vec<_>>>()?;

@@ -93,7 +93,7 @@ pub struct Worlds {
 impl WorldFlags {
     /// Attaches to the running server, or starts one after `check` has accepted the model.
     ///
-    /// `n_robots`: robots per world; `None`: one on a started server, any number on a running one.
+    /// `n_robots`: robots per world; `None`: one robot on a started server, any number on a running server.
     pub fn open(
         &self,
         needs_scouts: bool,
@@ -135,7 +135,7 @@ impl WorldFlags {
         Ok(Worlds { arena, _own: own })
     }
 
-    /// Returns the number of scored steps. Fails if the shortest episode has fewer.
+    /// Returns the number of scored steps. Fails if the shortest episode has fewer steps.
     pub fn steps(&self, info: &ServerInfo) -> Result<u64> {
         let longest = info.shortest_episode().unwrap_or(u64::MAX);
         let of_task = self.task().map(|task| task.max_steps);
@@ -186,7 +186,8 @@ fn robot_arguments(n_robots: u32) -> Vec<String> {
 }
 
 impl GridFlags {
-    /// Checks that the model fits the grid, and returns it. For recorded states, returns the beliefs' model, if any.
+    /// Checks that the model fits the grid, and returns it. For recorded states, returns the model with which beliefs
+    /// predict, if one was given.
     pub fn check(&self) -> Result<Option<Model>> {
         let (model, height, width) = match &self.task {
             Some(task) if task.is_recorded() => return Ok(None),

@@ -38,7 +38,7 @@ impl<'a> Acting<'a> {
         }
     }
 
-    /// Publishes the posterior of each robot whose view is due.
+    /// Publishes the posterior of each robot that is due to be shown to observers.
     fn show(&mut self) {
         let planning = self.planning / self.robots.len().max(1) as u32;
         for index in self.feed.due(self.robots.len()) {

@@ -25,14 +25,14 @@ pub struct TrainingSpec {
     pub takeover: bool,
     /// World steps to act, summed over all worlds; 0: until stopped.
     pub steps: u64,
-    /// Latest end, including the training of a belief; `None`: no limit.
+    /// Deadline, which also limits the training of a belief; `None`: no limit.
     pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
     pub freeze: bool,
     pub device: Device,
     pub config: AgentConfig,
-    /// Beliefs from earlier trainings, for decisions on them.
+    /// Beliefs from earlier trainings, for decisions that are based on them.
     pub learned: Learned,
 }
 
@@ -148,7 +148,7 @@ impl TrainingSpec {
         Ok(first..end)
     }
 
-    /// Returns the error for a learner that cannot continue. Its state is saved when the training ends.
+    /// Returns the error for a learner that cannot continue. The learner's state is saved when the training ends.
     pub(super) fn stopped(&self, problem: anyhow::Error, learner: &dyn Learner) -> anyhow::Error {
         if problem.is::<ConnectionError>() {
             return problem;

@@ -1,9 +1,9 @@
 //! TensorBoard event files: numbers and images over steps, which TensorBoard reads while they grow.
 //!
-//! A file is a sequence of TensorFlow records. A record has a length, its checksum, the bytes, and theirs. The bytes
-//! are protocol buffers of the types `Event` and `Summary`. Only a few of their fields are needed, so this module
-//! encodes them itself: the crate `tensorboard-rs` depends on protobuf 2 and image 0.23, which are long out of
-//! support. Steps must increase within a file: TensorBoard drops repeated steps.
+//! A file is a sequence of TensorFlow records. A record consists of a length, the checksum of the length, the data, and
+//! the checksum of the data. The data are protocol buffers of the types `Event` and `Summary`. Only a few of their
+//! fields are needed, so this module encodes them itself: the crate `tensorboard-rs` depends on protobuf 2 and
+//! image 0.23, which are long out of support. Steps must increase within a file: TensorBoard drops repeated steps.
 
 use anyhow::{Context, Result};
 use crc::{CRC_32_ISCSI, Crc};
@@ -16,7 +16,7 @@ const CASTAGNOLI: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
 const FILE_VERSION: &str = "brain.Event:2";
 
-/// `SessionLog.START`: TensorBoard discards all events written before, even in older files, for this and later steps.
+/// `SessionLog.START`: TensorBoard discards earlier events for this step and later steps, even in older files.
 const SESSION_START: u64 = 1;
 
 /// Number of the colour space RGB in `Summary.Image`.
@@ -104,7 +104,7 @@ fn record(bytes: &[u8]) -> Vec<u8> {
     [&length, &of_length[..], bytes, &of_bytes].concat()
 }
 
-/// Returns TensorFlow's masked CRC-32C, meant for bytes that may contain checksums themselves.
+/// Returns TensorFlow's masked CRC-32C. The mask is meant for data that may contain checksums themselves.
 fn masked_checksum(bytes: &[u8]) -> u32 {
     let checksum = CASTAGNOLI.checksum(bytes);
     checksum.rotate_right(15).wrapping_add(0xa282_ead8)

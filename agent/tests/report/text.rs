@@ -5,7 +5,7 @@ use emberwatch_agent::benchmark::report::{PolicyRun, RunsFile, render_table, wri
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
+/// Returns runs on worlds 1, 2, 3: `coverage` earns 1, 3, 5, `beam` earns 2, 5, 8, and the oracle earns 4, 8, 8.
 fn three_policies() -> Vec<PolicyRun> {
     let mut runs = Vec::new();
     for (policy, estimator, rewards) in [
@@ -36,7 +36,7 @@ fn row(table: &str, policy: &str, skip: usize) -> Vec<String> {
 fn a_table_gives_errors_over_worlds_and_paired_differences() {
     let table = render_table(&three_policies(), "coverage");
     assert!(table.starts_with("3 worlds, 4 steps each; "), "{table}");
-    // Deviations -3, 0, 3: sqrt(18 / 2 / 3) = 1.73. Differences 1, 2, 3: sqrt(2 / 2 / 3) = 0.58.
+    // Standard errors: sqrt(18 / 2 / 3) = 1.73 for the rewards 2, 5, 8, and sqrt(2 / 2 / 3) = 0.58 for the differences.
     for (policy, expected) in [
         (
             "beam",
@@ -80,7 +80,7 @@ fn teams_are_compared_with_as_many_robots_alone() {
         table.contains("to beam alone with as many robots"),
         "{table}"
     );
-    // Means over worlds of 2 (w + 1) and 3 (w + 1); differences w + 1: sqrt(2 / 2 / 3) = 0.58.
+    // World w has the rewards 2 (w + 1) and 3 (w + 1). Standard error of the differences w + 1: sqrt(2 / 2 / 3) = 0.58.
     for (skip, expected) in [
         (2, "alone 2 4.00 ± 1.15 2.00 baseline 60.0 0.250 0.250"),
         (3, "joint 2 6.00 ± 1.73 3.00 +2.00 ± 0.58 60.0 0.250 0.125"),
@@ -130,8 +130,9 @@ fn figures_of_merit_say_in_how_many_worlds_fire_was_detected() {
     let mut runs = with_merit();
     let table = render_table(&runs, "coverage");
     assert!(table.contains("in the last 25 steps"), "{table}");
-    // Errors: steps 1, 2, 3: sqrt(2 / 2 / 3) = 0.6. Seen 50, 70, 90 %: sqrt(800 / 2 / 3) = 11.5, also for differences.
-    // A world has no time without a detection, and no distance without a front. The oracle's rows are from an old file.
+    // Standard errors: sqrt(2 / 2 / 3) = 0.6 for detection after 1, 2, 3 steps, and sqrt(800 / 2 / 3) = 11.5 for seen
+    // shares of 50, 70, 90 % and their differences. A world without a detection has no detection time, and a world
+    // without unseen fire has no distance. The oracle's rows are from an old file.
     for expected in [
         "beam 3 of 3 2.0 ± 0.6 100.0 ± 0.0 70.0 ± 11.5 +40.0 ± 11.5 12.5 ± 0.0 50.0 ± 0.0",
         "coverage 2 of 3 40.0 ± 0.0 300.0 ± 0.0 30.0 ± 0.0 baseline - 50.0 ± 0.0",
@@ -247,7 +248,7 @@ fn scores_of_tasks_lie_between_the_random_walk_and_the_oracle() {
     );
     // The second row of `beam` has its Brier scores.
     assert_eq!(row(&table, "beam", 1), ["beam", "0.1250", "0.1250"]);
-    // Without an oracle better than the random walk there is no scale.
+    // If the oracle is not better than the random walk, there is no scale.
     let flat = task("flat", &[floor, ("oracle_ahead", [2.0, 0.0]), beam]);
     assert!(flat.scores("beam").is_empty());
     let table = render_suite(&[a, flat]);

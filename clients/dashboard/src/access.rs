@@ -13,7 +13,7 @@ use std::net::IpAddr;
 /// A host and its port, as in `Host` and in `Origin`.
 #[derive(Debug, PartialEq)]
 struct Place {
-    /// In lower case; an address in its shortest form, without brackets.
+    /// The host, in lower case; an address is in its shortest form, without brackets.
     name: String,
     is_address: bool,
     /// `None` for the scheme's default port.
@@ -72,14 +72,15 @@ impl Place {
         })
     }
 
-    /// Returns whether nobody else can point this host at this machine.
+    /// Returns whether the host is an address, `localhost` or one of `names`, which no stranger can point at this
+    /// machine.
     fn is_own(&self, names: &[String]) -> bool {
         let is_own = |name: &String| name.eq_ignore_ascii_case(&self.name);
         self.is_address || self.name == "localhost" || names.iter().any(is_own)
     }
 
-    /// Returns whether an origin is this place. A missing port stands for the default port of the origin's scheme,
-    /// because a proxy may forward the host without its port.
+    /// Returns whether an origin has this host and port. A missing port stands for the default port of the origin's
+    /// scheme, because a proxy may forward the host without its port.
     fn has_origin(&self, origin: &str) -> bool {
         let (default_port, rest) = match origin.split_once("://") {
             Some(("http", rest)) => (80, rest),

@@ -35,7 +35,7 @@ pub struct Album {
     early: VecDeque<(u32, Key, Box<[u8]>)>,
 }
 
-/// The kept steps of one world. Serial numbers count them in the order of arrival.
+/// The kept steps of one world. Their serial numbers follow the order of arrival.
 #[derive(Debug, Default)]
 pub struct Strip {
     entries: VecDeque<Entry>,
@@ -211,7 +211,7 @@ impl Strip {
         self.entries.iter()
     }
 
-    /// Returns the step with this key if it is among the latest, and the agent whose beliefs are shown.
+    /// Returns the step with this key, if it is among the latest, and the agent whose beliefs are shown.
     fn entry(&mut self, key: Key) -> Option<(&mut Entry, &mut Option<(u32, Instant)>)> {
         let mut latest = self.entries.iter_mut().rev().take(MAX_DELAY);
         let entry = latest.find(|entry| entry.key() == key)?;

@@ -151,7 +151,7 @@ impl Robot {
 }
 
 impl Belief {
-    /// Converts a published belief. Scores it if its states are the model's `states` and `truth` is known.
+    /// Converts a published belief. Scores the belief if its states are the model's `states` and `truth` is known.
     pub(crate) fn of(
         published: &AgentBelief,
         truth: Option<&[u8]>,

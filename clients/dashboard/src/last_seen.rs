@@ -15,7 +15,7 @@ pub(crate) struct LastSeen {
 }
 
 impl LastSeen {
-    /// Collects the observations of the run that ends at the entry `last`, which has this serial number.
+    /// Collects the observations of the run that ends at the entry `last`, whose serial number is `serial`.
     pub(crate) fn of(strip: &Strip, serial: u64, last: &Entry) -> Self {
         let n_cells = last.shape.n_cells();
         let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);

@@ -19,7 +19,7 @@ use tokio::net::TcpListener;
 /// Interval at which the program checks whether to end.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Niceness, of at most 19: on a busy machine, a simulator that wakes up runs first.
+/// This process's niceness (at most 19). With it, on a busy machine, a simulator that wakes up runs first.
 const NICENESS: i32 = 5;
 
 /// The expectation that errors about `--listen` report.

@@ -17,10 +17,10 @@ use std::time::{Duration, Instant};
 /// Minimum and maximum number of points of a time series.
 const BINS: (usize, usize) = (16, 2000);
 
-/// The number that stands for no objective.
+/// Marks a point of the time series without an objective.
 const NO_OBJECTIVE: u8 = 255;
 
-/// Maximum number of distinct objectives. Further objectives are shown as the last one.
+/// Maximum number of distinct objectives. Any further objective is shown as the last of these.
 const MAX_OBJECTIVES: usize = 255;
 
 /// Maximum age difference for which a step with a belief is shown instead of a newer step without a belief.
@@ -38,7 +38,7 @@ pub struct Ask {
     pub at: Option<u64>,
     /// Number of points per time series.
     pub bins: usize,
-    /// A recording's new speed, as [`Player::speed`].
+    /// A recording's new speed, in the unit of [`Player::speed`].
     #[serde(default)]
     pub speed: Option<f64>,
     /// Whether the recording should play.
@@ -188,8 +188,8 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
     [framed(&header), arrays.bytes].concat()
 }
 
-/// Returns the newest step with a belief if it is at most [`BELIEF_LAG`] older than the newest step, which it otherwise
-/// returns.
+/// Returns the newest step with a belief if it is at most [`BELIEF_LAG`] older than the newest step. Otherwise, returns
+/// the newest step.
 fn newest(strip: &Strip) -> Option<(u64, &Entry)> {
     let (_, last) = strip.kept()?;
     let newest = strip.nearest(last)?;
@@ -311,7 +311,7 @@ fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     number as u8
 }
 
-/// Returns the server's airspace. If it is unknown or belongs to another grid, returns one without no-fly cells.
+/// Returns the server's airspace. If that is unknown or belongs to another grid, returns one without no-fly cells.
 fn airspace(info: Option<&Info>, entry: &Entry) -> Airspace {
     let known = info.and_then(|info| info.airspace.clone());
     let known = known.filter(|airspace| airspace.shape() == entry.shape);

@@ -1,4 +1,4 @@
-//! Everything that the page can show. Some threads fill it, and the web server reads it to answer browsers.
+//! Everything that the page can show. Some threads fill the scene, and the web server reads it to answer browsers.
 
 use crate::album::Album;
 use crate::entry::States;
@@ -69,9 +69,10 @@ pub struct Info {
     target_state: Option<usize>,
     observations: Vec<String>,
     observation_colours: Option<Vec<String>>,
-    /// Number of observation values on the path. The values of each outer ring follow, and have the same colours.
+    /// Number of observation values for cells on the path. The values for each outer ring come after these, in the same
+    /// colours.
     n_named: usize,
-    /// Rows and columns that robots see beyond their path.
+    /// Number of rows and columns that robots see beyond their path.
     radius: usize,
     zones: Option<Vec<String>>,
     zone_colours: Option<Vec<String>>,

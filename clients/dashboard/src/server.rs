@@ -142,7 +142,7 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
         let wanted = Some((ask.world, ask.at));
         if before == wanted {
             tokio::select! {
-                // A change since the last picture ends the wait. So does the next request.
+                // A change since the last picture, or the next request, ends the wait.
                 _ = timeout(PATIENCE, changes.changed()) => {}
                 message = socket.recv() => match message {
                     Some(Ok(message)) => early = Some(message),

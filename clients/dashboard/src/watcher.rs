@@ -199,8 +199,8 @@ impl Reader {
 
     /// Reads the available samples. Returns true if there were many.
     fn look(&mut self, stage: &Stage) -> Result<bool, ChannelError> {
-        // Beliefs are read first. Their frames are published at about the same time, so by the time frames are read,
-        // these have usually arrived.
+        // Beliefs are read first. A belief and its frame are published at about the same time, so when the frames are
+        // read, the belief's frame has usually arrived.
         let beliefs = self.agents.as_ref().map_or(Ok(Vec::new()), all)?;
         let frames = all(&self.frames)?;
         let truths = self.truth.as_ref().map_or(Ok(Vec::new()), all)?;

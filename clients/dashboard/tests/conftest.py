@@ -1,4 +1,4 @@
-"""Gives each test a deadline, programs that end with it, and a browser whose errors fail it."""
+"""Fixtures: a deadline for each test, programs that end with the test, and a browser."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, BrowserContext, sync_playwright
 from looking import Look
 from running import PATIENCE, Dashboard, Program, Programs
 
-#: Deadline of a whole test, in seconds. It is long, because a busy machine is not a bug.
+#: Deadline of a whole test, in seconds. It is long, so that a busy machine does not fail a test.
 DEADLINE = 900
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -55,7 +55,7 @@ def chromium(request: pytest.FixtureRequest) -> Iterator[Browser]:
 
 @pytest.fixture
 def programs(request: pytest.FixtureRequest) -> Iterator[Programs]:
-    """Starts programs, for example with `programs.server(worlds=4)`. All end with the test."""
+    """Starts programs, for example with `programs.server(worlds=4)`. They end with the test."""
     with ExitStack() as stack:
         yield Programs(request.config.getoption("--programs"), stack)
 

@@ -150,7 +150,7 @@ fn a_picture_joins_frame_truth_and_belief_of_a_step() {
         [0, 128, 128, 0, 128, 128, 255, 128, 128, 255, 128, 128]
     );
     assert_eq!(array("entropy"), [0, 255, 255, 0, 255, 255]);
-    // Four of the six cells cost ln 2, and two cost nothing.
+    // Four of the six cells add ln 2 to the loss, and two add nothing.
     let log_loss = header["shown"]["log_loss"].as_f64().expect("a number");
     assert!(
         (log_loss - 4.0 / 6.0 * 2f64.ln()).abs() < 1e-6,

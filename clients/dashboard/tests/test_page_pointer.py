@@ -69,7 +69,7 @@ def test_what_moves_under_the_pointer_is_told(resting):
     assert not is_at_robot(look)
     look.page.set_viewport_size({"width": 1280, "height": 720})
     look.eventually(lambda: is_at(look, "row 23, col 31"), "the last cell again")
-    # Keys or pointer select the cell, whichever was used last.
+    # The keys or the pointer select the cell, whichever was used last.
     look.page.get_by_label("cells of seen so far").focus()
     look.page.keyboard.press("ArrowDown")
     look.eventually(lambda: is_at(look, "row 13, col 16"), "where the key went")

@@ -69,7 +69,7 @@ def test_what_is_lost_or_not_known_is_told(watched):
             words["shown"] |= {"seen_since": 12, "log_loss": None}
         if words["agent"]:
             words["agent"]["states"] = ["this", "that", "other"]
-        # The agent has soon seen every cell, so the frame of its last path replaces `seen`.
+        # The agent soon has seen every cell, so the test sends its last path's frame as `seen`.
         names = {"series_log_loss": "unscored", "seen": "all", "frame": "seen"}
         for array in words["arrays"]:
             array["name"] = names.get(array["name"], array["name"])

@@ -1,6 +1,6 @@
 """Measures how soon Ctrl-C and the death of a server end a waiting step.
 
-Peers: Ctrl-C in `time.sleep`, and a pidfd that reports the end of the same server.
+For comparison: Ctrl-C in `time.sleep`, and a pidfd that reports the end of the same server.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from emberwatch.errors import ServerGoneError
 
 N_ROUNDS = 20
 
-#: Seconds after which a step surely waits for its answer.
+#: Seconds after which a step is certainly waiting for its answer.
 PAUSE = 0.05
 
 TIMEOUT = 20.0

@@ -1,9 +1,9 @@
 """Measures moves per second of `WildfireMoves-v0`, and decisions of `WildfireObjective-v1`.
 
-Peers: Gymnasium's `SyncVectorEnv` around the single environments, and around an environment with
-the same spaces that simulates nothing. Rounds alternate, so that noise on the machine affects all
-alike. Prints medians over rounds, per second of wall time and per second of this process's
-processor time.
+For comparison: Gymnasium's `SyncVectorEnv` around the single environments, and around an
+environment with the same spaces that simulates nothing. Rounds alternate, so that noise on the
+machine affects all environments alike. Prints median rates over the rounds, per second of wall time
+and per second of this process's processor time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NO_END = 2**31 - 1
 
 
 class Trivial(gymnasium.Env[Any, Any]):
-    """The same spaces without a simulation."""
+    """An environment with the same spaces that simulates nothing."""
 
     def __init__(self, like: gymnasium.Env[Any, Any]) -> None:
         self.observation_space, self.action_space = like.observation_space, like.action_space

@@ -1,8 +1,8 @@
 """Measures steps per second of several processes with their own worlds, or with a shared server.
 
 All processes step at the same time, each its own worlds as one vector environment. Rounds
-alternate, so that noise on the machine affects all alike. Prints the median over rounds of the
-total rate.
+alternate, so that noise on the machine affects both cases alike. Prints the total rate of all
+processes, as the median over rounds.
 """
 
 from __future__ import annotations

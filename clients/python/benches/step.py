@@ -1,9 +1,9 @@
-"""Measures how fast the environments step, compared with peers in the same run.
+"""Measures how fast the environments step, compared with other libraries in the same run.
 
-Rounds of all rows alternate, so that noise on the machine affects all alike. Peers: Gymnasium's
-`AsyncVectorEnv(shared_memory=True)` around an environment with the same spaces that simulates
-nothing, and EnvPool's CartPole where it is installed (in process, 4 numbers per step). Prints the
-medians of p50 and p99 over rounds, with their minima and maxima.
+Rounds of all rows alternate, so that noise on the machine affects all rows alike. For comparison:
+Gymnasium's `AsyncVectorEnv(shared_memory=True)` around an environment with the same spaces that
+simulates nothing, and EnvPool's CartPole where it is installed (in process, 4 numbers per step).
+Prints the medians of p50 and p99 over rounds, with their minima and maxima.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NO_END = 2**31 - 1
 
 
 class Trivial(gymnasium.Env[Any, Any]):
-    """The spaces of `Wildfire-v0` without a simulation."""
+    """An environment with the spaces of `Wildfire-v0` that simulates nothing."""
 
     def __init__(self) -> None:
         frame = gymnasium.spaces.Box(0, 255, (64, 64, 1), np.uint8)

@@ -40,8 +40,8 @@ def model() -> Model:
     """Returns the fire's model.
 
     The weights give P(ignite) = f / (A f + B), which is exact for f = 1 and f = 4, and off by at
-    most .015 for f = 2 and f = 3. Trees outside the grid are healthy. Each column is a zone, as
-    columns differ in a.
+    most .015 for f = 2 and f = 3. Trees outside the grid are healthy. Each column is a zone of its
+    own, as a differs between columns.
     """
     zones, kernels = [], []
     for column, rate in enumerate(RATES.tolist()):

@@ -197,7 +197,7 @@ class Training:
         torch.save(self.belief.state_dict(), self.args.out / "belief.pt")
 
     def update(self, optimizer: Any, replay: Replay) -> tuple[float, float]:
-        """Updates the network once. Returns its loss and the filter's, in nats per visited cell."""
+        """Updates the network once. Returns its loss and the filter's loss, in nats per cell."""
         images, frames = replay.sample(64, self.rng)
         visited = frames != UNOBSERVED
         if not visited.any():

@@ -72,7 +72,7 @@ class NodeServer:
 
 @ray.remote(num_cpus=0)
 class Servers:
-    """The servers of all nodes, each started on request. They end with the training, even if
+    """The servers of all nodes, each started on request. The servers end with the training, even if
     it crashes."""
 
     def __init__(self, n_worlds: int) -> None:
@@ -121,7 +121,7 @@ def scaled(envs: gymnasium.vector.VectorEnv) -> gymnasium.vector.VectorEnv:
 
 
 def places(algorithm: Algorithm) -> dict[tuple[str, int], list[int]]:
-    """Returns the runners' process ids by server, which is a node and a process id."""
+    """Returns the runners' process ids by server, given as its node and process id."""
 
     def place(runner: Any) -> tuple[tuple[str, int], int]:
         node = ray.get_runtime_context().get_node_id()

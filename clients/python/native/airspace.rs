@@ -28,12 +28,12 @@ impl Given<'_> {
             return Err(invalid(py, "airspace: no_fly", expected, got));
         }
         let no_fly = no_fly.map(Arc::new);
-        // One ring is enough: paths do not depend on the sensor's rings.
+        // The number of rings is 1 here, because paths do not depend on it.
         Ok(Airspace::new(shape, no_fly, self.radius, 1, self.pays()))
     }
 
-    /// Describes worlds with a hidden model, of which only the number of observation values is known. Treats each value
-    /// as a state that the sensor shows exactly.
+    /// Describes worlds whose model is hidden, so that only the number of observed values is known. Treats each value
+    /// as a state that the sensor shows without errors.
     pub fn seen(&self, n_observations: usize) -> Description {
         let n_values = n_observations / self.n_rings.max(1);
         let shown = |value: usize| {

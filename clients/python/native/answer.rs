@@ -19,7 +19,7 @@ use std::ops::Range;
 /// Total size of one world's result and one robot's result, in bytes.
 pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
-/// Maximum number of robots in an answer: all robots of the largest server, with the largest teams.
+/// Maximum number of robots in an answer: the number of all robots of the largest server.
 const MAX_ROBOTS: u32 = 1 << 16;
 
 type Arguments = (u32, usize, usize, u32, u32, u32, u64, Py<PyArray1<u8>>);
@@ -135,7 +135,7 @@ impl Answer {
         self.slice(py, self.n_worlds() * WORLD_BYTES..self.head())
     }
 
-    /// For each robot, the bytes of its world's result followed by those of its own result. A new array.
+    /// For each robot, its world's result followed by its own result, as bytes in a new array.
     #[getter]
     fn results<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
         let payload = self.bytes(py)?;
@@ -161,8 +161,8 @@ impl Answer {
         Ok((of_world(&world), of_robot(&robot)))
     }
 
-    /// Returns the results of the first robot's step. `pays` selects its reward: 0 the robot's share, 1 the team's
-    /// reward, 2 the marginal reward.
+    /// Returns the results of the first robot's step. `pays` selects the kind of reward: 0 is the robot's share, 1 the
+    /// team's reward, 2 the robot's marginal reward.
     fn numbers<'py>(&self, py: Python<'py>, pays: u8) -> Numbers<'py> {
         let (world, robot) = self.first;
         (

@@ -1,4 +1,4 @@
-//! The worlds behind a connection: a server's, or worlds in this process.
+//! The worlds behind a connection: either a server's worlds, or worlds in this process.
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::refusal::failed;
@@ -30,8 +30,8 @@ impl Worlds {
     }
 }
 
-/// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. With `warns`, warns of
-/// robots whose start cells are enclosed by no-fly cells.
+/// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. If `warns` is set, warns
+/// about robots whose start cells are enclosed by no-fly cells.
 pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedded> {
     let checked = checked(py, settings)?;
     if warns {
@@ -94,7 +94,7 @@ fn may_block(given: &Map<String, Value>) -> bool {
     others.next().is_some()
 }
 
-/// Warns of robots whose start cells are enclosed by no-fly cells.
+/// Warns about robots whose start cells are enclosed by no-fly cells.
 fn warn_of_starts(py: Python<'_>, checked: &Checked) -> PyResult<()> {
     let mut starts = checked.reach.closed_in.iter();
     starts.try_for_each(|closed_in| warn(py, closed_in))

@@ -23,7 +23,7 @@ use std::time::Duration;
 /// Time between two checks for Ctrl-C in a long computation.
 const LOOK: Duration = Duration::from_millis(2);
 
-/// The operator `Phi` of one model on one grid. Threads cannot share it.
+/// The operator `Phi` of one model on one grid. Only one thread at a time may use it.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Transition {
     /// The model file's text.
@@ -32,7 +32,7 @@ pub struct Transition {
     work: Mutex<Work>,
 }
 
-/// The operator and its work space, which allow one application at a time.
+/// The operator with its scratch memory, which only one call at a time may use.
 struct Work {
     /// The operator, or the error that `apply` raises because eq. 3 could divide by zero.
     operator: Result<transition::Transition<f64>, ModelError>,
@@ -45,7 +45,7 @@ impl Transition {
     #[new]
     fn new(py: Python<'_>, model: String, height: usize, width: usize) -> PyResult<Self> {
         let (parameters, shape) = (model_of(&model)?, shape_of(py, height, width)?);
-        // Memory for two beliefs, and for a third belief with margins, in the work space.
+        // The scratch memory holds two beliefs, and a third one with margins around the grid.
         let n_bytes = 3 * parameters.n_states() * shape.n_cells() * size_of::<f64>();
         check_memory(py, "beliefs", n_bytes)?;
         let none = Array3::zeros((parameters.n_states(), height, width));
@@ -116,7 +116,7 @@ impl Transition {
     }
 }
 
-/// Makes the error of a model whose transition weights can all be 0, or can lose their precision.
+/// Creates the exception for a model whose transition weights can all be 0, or can lose their precision.
 pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
     match error {
         ModelError::ZeroWeight { cell, .. } => {
@@ -218,7 +218,7 @@ pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let cancelled = AtomicBool::new(false);
     let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
-    // Each thread simulates one world at a time and counts its states.
+    // Each thread simulates one world at a time, and counts for each cell how often each state occurs.
     let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
     let n_bytes = 2 * n_threads * of_thread;
     check_memory(py, "the worlds of a first belief", n_bytes)?;

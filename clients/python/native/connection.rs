@@ -22,10 +22,10 @@ use pyo3::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Expected step duration below which the interpreter stays locked: 1 ms, in nanoseconds.
+/// Steps that are expected to be shorter than this keep the interpreter locked: 1 ms, in nanoseconds.
 const BRIEF_NANOS: u64 = 1_000_000;
 
-/// A connection to a server, or worlds in this process. Threads can share it and then take turns.
+/// A connection to a server, or worlds in this process. Threads can share it; their requests run one after another.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Server {
     pub worlds: Owned<Worlds>,
@@ -48,8 +48,8 @@ impl Server {
         Self::of(py, instance, Worlds::Served(Box::new(wire)))
     }
 
-    /// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. With `warns`, warns of
-    /// robots whose start cells are enclosed by no-fly cells.
+    /// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. If `warns` is set,
+    /// warns about robots whose start cells are enclosed by no-fly cells.
     #[staticmethod]
     #[pyo3(name = "embedded")]
     fn new_embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Self> {
@@ -63,8 +63,8 @@ impl Server {
         serde_json::to_string(&self.info).expect("invariant: replies serialise")
     }
 
-    /// Returns the hidden states of consecutive embedded worlds, as the fields of `Truth`. The worlds must publish
-    /// them.
+    /// Returns the hidden states of consecutive embedded worlds, as the fields of `Truth`. The setting `publish_truth`
+    /// must be on.
     fn truths<'py>(
         &self,
         py: Python<'py>,
@@ -143,7 +143,7 @@ impl Server {
         })
     }
 
-    /// Converts an answer for Python, or makes the exception for its error.
+    /// Converts an answer to its Python object, or an error to its exception.
     pub fn answered(
         &self,
         py: Python<'_>,
@@ -156,21 +156,21 @@ impl Server {
     }
 
     /// Returns whether a step of this number of robots is expected to be so short that it can keep the interpreter
-    /// locked. Taking the interpreter back from a busy thread costs 5 ms. Before the first step, returns `false`
-    /// because no duration is known.
+    /// locked. Otherwise, getting the interpreter back from a busy thread can take 5 ms. Returns `false` before the
+    /// first step, when no duration is known.
     pub fn is_brief(&self, n_robots: u32) -> bool {
         let nanos = self.nanos_of_robot.load(Ordering::Relaxed);
         self.is_embedded && nanos > 0 && nanos.saturating_mul(n_robots.into()) < BRIEF_NANOS
     }
 
-    /// Records the duration of a step of this number of robots.
+    /// Records how long a step of this number of robots took.
     pub fn took(&self, nanos: u64, n_robots: u32) {
         let nanos = nanos / u64::from(n_robots.max(1));
         self.nanos_of_robot.store(nanos.max(1), Ordering::Relaxed);
     }
 }
 
-/// Copies a world's latest result and hidden states. Needs no lock on the interpreter.
+/// Copies a world's latest result and hidden states. Does not need the interpreter lock.
 fn copied((world, episode): (usize, &Episode)) -> (usize, WorldResult, Array2<u8>) {
     (
         world,

@@ -13,13 +13,13 @@ use std::ffi::CString;
 use std::fmt::Display;
 
 thread_local! {
-    /// The exception that Python raised while this thread waited, for example in a signal handler.
+    /// The exception that ended a wait of this thread, for example one raised by a signal handler.
     static RAISED: RefCell<Option<PyErr>> = const { RefCell::new(None) };
 }
 
-/// Runs Python's signal handlers; returns whether one raised.
+/// Runs Python's signal handlers; returns whether one raised an exception.
 pub fn interrupted() -> bool {
-    // Python runs handlers only on its main thread; any other thread might wait for the interpreter in vain.
+    // Python runs signal handlers only on its main thread, so other threads need not wait for the interpreter here.
     #[cfg(target_os = "linux")]
     let may_be_main = rustix::thread::gettid() == rustix::process::getpid();
     #[cfg(not(target_os = "linux"))]
@@ -34,45 +34,46 @@ pub fn interrupted() -> bool {
         })
 }
 
-/// Stores an exception, and returns the error of an interrupted wait, for which [`raise`] returns the exception.
+/// Stores an exception, and returns the error of an interrupted wait. [`raise`] turns this error back into the
+/// exception.
 pub fn interruption(raised: PyErr) -> ConnectionError {
     RAISED.set(Some(raised));
     ChannelError::Interrupted.into()
 }
 
-/// Makes an exception by calling the class or function of this name in `emberwatch/errors.py`.
+/// Creates an exception by calling the class or function of this name in `emberwatch/errors.py`.
 pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) -> PyErr {
     let module = py.import("emberwatch.errors");
     let made = module.and_then(|module| module.getattr(name)?.call1(arguments));
     made.map_or_else(|error| error, PyErr::from_value)
 }
 
-/// Makes the error of insufficient memory.
+/// Creates the exception for insufficient memory.
 pub fn no_memory(py: Python<'_>, short: &NoMemory) -> PyErr {
     error(py, "NotEnoughMemoryError", (short.to_string(),))
 }
 
 /// Checks that there is enough memory for data whose size depends on arguments.
 pub fn check_memory(py: Python<'_>, what: impl Display, n_bytes: usize) -> PyResult<()> {
-    // Reading the limits takes about 0.1 ms, which is not worth it for less than 16 MiB.
+    // Reading the memory limits takes about 0.1 ms, so less than 16 MiB is not checked.
     if n_bytes < 16 << 20 {
         return Ok(());
     }
     memory::check(what, n_bytes as u64).map_err(|short| no_memory(py, &short))
 }
 
-/// Makes the error of threads that the system did not start.
+/// Creates the exception for threads that the system could not start.
 pub fn no_threads(py: Python<'_>, short: &NoThreads) -> PyErr {
     error(py, "EmberwatchError", (short.to_string(), "threads"))
 }
 
-/// Issues a `UserWarning` to the caller of the package's function.
+/// Issues a `UserWarning` at the line of Python code that called into this module.
 pub fn warn(py: Python<'_>, words: impl Display) -> PyResult<()> {
     let words = CString::new(words.to_string())?;
     PyErr::warn(py, &py.get_type::<PyUserWarning>(), &words, 1)
 }
 
-/// Makes the exception for a request that failed. `what` names the request; `seconds` was its timeout.
+/// Creates the exception for a request that failed. `what` names the request; `seconds` was its timeout.
 pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64) -> PyErr {
     match problem {
         ConnectionError::Channel(problem) => raise_of_channel(py, problem),
@@ -103,7 +104,7 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
     }
 }
 
-/// Makes the exception for a channel that could not be opened or used.
+/// Creates the exception for a channel that could not be opened or used.
 pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
     let text = problem.to_string();
     match problem {

@@ -1,4 +1,4 @@
-//! The agent's estimators for Python: beliefs of one kind about `n` worlds, which frames correct.
+//! The agent's estimators for Python: beliefs of one kind about `n` worlds, which are corrected with frames.
 
 use crate::detached::detached;
 use crate::model::{model_of, shape_of};
@@ -24,11 +24,11 @@ use std::any::Any;
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
-/// One number per world.
+/// An array with one number per world.
 type Numbers<'py> = Bound<'py, PyArray1<f64>>;
 
-/// Beliefs about `n` worlds. Threads cannot share them. `chosen` is a mask of worlds, `[n]`; the Python class has
-/// checked the shapes of all arrays.
+/// Beliefs about `n` worlds. Only one thread at a time may use them. In all methods, `chosen` is a mask of worlds,
+/// `[n]`. The Python class has checked the shapes of all arrays.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Estimators {
     #[pyo3(get)]
@@ -52,7 +52,7 @@ struct State {
     threads: Pool,
 }
 
-/// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds.
+/// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds of estimators.
 fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
     let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
     let to = (to as &mut dyn Any).downcast_mut::<SpatialFilter>();
@@ -92,8 +92,8 @@ impl Estimators {
         Self::new(py, origin, n_worlds)
     }
 
-    /// Loads beliefs from a checkpoint. `kind` defaults to the kind that the checkpoint was trained for. With a model,
-    /// checks that the checkpoint fits its worlds.
+    /// Loads beliefs from a checkpoint. `kind` defaults to the kind that the checkpoint was trained for. If a model is
+    /// given, checks that the checkpoint fits it.
     #[staticmethod]
     fn load(
         py: Python<'_>,
@@ -155,8 +155,8 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep the
-    /// learned correlations of cells.
+    /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep the correlations
+    /// between cells that they have learned.
     fn reset(
         &self,
         py: Python<'_>,
@@ -316,7 +316,7 @@ impl Estimators {
         self.state_names.len() * self.shape.n_cells()
     }
 
-    /// Locks the worlds for this thread.
+    /// Locks the estimators for this thread.
     ///
     /// # Errors
     /// If another thread is using them.
@@ -373,7 +373,7 @@ fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
     }
 }
 
-/// Makes the error of a belief that could not be built, or could not be corrected with a frame.
+/// Creates the exception for a belief that could not be built, or could not be corrected with a frame.
 pub fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     let is_impossible = matches!(
         error.downcast_ref::<EstimatorError>(),

@@ -1,4 +1,4 @@
-//! Paths that many robots fly move by move. Each row belongs to one robot: its cell, visited cells and reward.
+//! Paths that many robots fly move by move. Each row of the arrays is about one robot.
 
 use crate::airspace::Given;
 use crate::errors::check_memory;
@@ -27,7 +27,7 @@ type Arguments = (
 
 /// The current path of each robot, up to its latest move.
 ///
-/// No method unlocks the interpreter: another thread that reads this object meanwhile would get an error.
+/// No method releases the interpreter lock, because another thread that used this object meanwhile would get an error.
 #[pyclass(module = "emberwatch._native")]
 pub struct Flights {
     shape: Shape,
@@ -35,8 +35,8 @@ pub struct Flights {
     /// The Python `Airspace` that this was built from.
     given: Option<Py<PyAny>>,
     n_moves: usize,
-    /// The reward of each hidden state. It is paid when a cell in that state is first visited, or first seen if the
-    /// sensor pays for seen cells. `None`: no rewards.
+    /// The reward of each hidden state. A cell pays the reward of its state when it is first visited, or when it is
+    /// first seen if the airspace pays for seen cells. `None`: no rewards.
     reward: Option<Vec<f64>>,
     cells: Vec<Cell>,
     n_made: Vec<usize>,
@@ -44,7 +44,7 @@ pub struct Flights {
     states: Vec<u8>,
     moves: Vec<u8>,
     paid: Vec<f64>,
-    /// Whether each cell's reward has been paid.
+    /// For each cell, whether its reward has been paid.
     has_paid: Vec<bool>,
     /// Work space.
     sight: (Vec<SeenCell>, Vec<u8>),
@@ -109,7 +109,7 @@ impl Flights {
         PyArray1::from_iter(py, flat).reshape([self.cells.len(), 2])
     }
 
-    /// Number of moves that each robot has made.
+    /// Number of moves that each robot has made in its current path.
     #[getter]
     fn n_made<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
         PyArray1::from_iter(py, self.n_made.iter().map(|&n| n as i64))
@@ -128,8 +128,8 @@ impl Flights {
         PyArray1::from_slice(py, &self.paid)
     }
 
-    /// The action masks, `[n_rows, 4]`: 1 for each move that takes a robot to another cell, otherwise 0. All 1 if no
-    /// move does.
+    /// The action masks, `[n_rows, 4]`: 1 for each move that takes a robot to another cell, otherwise 0. If no move
+    /// does, the robot's whole mask is 1.
     #[getter]
     fn masks<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<i8>>> {
         let mut masks = Vec::with_capacity(self.cells.len() * Move::ALL.len());
@@ -199,7 +199,7 @@ impl Flights {
         PyArray1::from_vec(py, paths).reshape([self.cells.len(), self.n_moves])
     }
 
-    /// Returns the moves that one robot has made.
+    /// Returns the moves that one robot has made in its current path.
     fn made<'py>(&self, py: Python<'py>, row: usize) -> PyResult<Bound<'py, PyArray1<u8>>> {
         let n_rows = self.cells.len();
         let expected = || invalid(py, "row", format!("a row below {n_rows}"), row);
@@ -208,7 +208,7 @@ impl Flights {
         Ok(PyArray1::from_slice(py, made))
     }
 
-    /// Makes one move in each row marked in `moved`. `actions` are below 4. Returns the reward of each row.
+    /// Makes one move in each row marked in `moved`. Each action is a move, 0 to 3. Returns the reward of each row.
     fn r#move<'py>(
         &mut self,
         py: Python<'py>,
@@ -273,7 +273,8 @@ impl Flights {
         paid
     }
 
-    /// Returns the reward of the first visit to cell `index`. `first` is the offset of the robot's grid in the arrays.
+    /// Returns the reward of a robot's first visit to cell `index`. `first` is the offset of the robot's grid in the
+    /// arrays.
     fn pay(&mut self, first: usize, index: usize) -> f64 {
         let Some(reward) = &self.reward else {
             return 0.0;

@@ -1,5 +1,5 @@
-//! Hooks for forks of this process. A fork waits until no thread is creating or removing a channel. The child clears
-//! the cached process id of its parent.
+//! Hooks for forks of this process. A fork waits until no thread is creating or removing a channel. In the child, the
+//! cached process id of the parent is cleared.
 
 use crate::owned::forget_pid;
 #[cfg(target_os = "linux")]
@@ -7,7 +7,7 @@ use emberwatch_protocol::turn;
 use pyo3::prelude::*;
 use pyo3::types::IntoPyDict;
 
-/// Has Python call the hooks at each fork of this process.
+/// Registers the hooks with Python, which calls them at each fork of this process.
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
     let hooks = [

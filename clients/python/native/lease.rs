@@ -46,9 +46,9 @@ impl Lease {
         self.server.get().answered(py, answer, seconds).map(Some)
     }
 
-    /// Flies a path with each robot, and resends the paths until the worlds have stepped. Returns the latest results,
-    /// and the number of missed steps before these; `None` as in `step`. With `accepts_late`, it is no error if a world
-    /// steps without these paths.
+    /// Flies a path with each robot. After each timeout, checks whether the worlds have stepped, and sends the paths
+    /// again if not. Returns the latest results, and the number of steps missed before them; `None` as in `step`. With
+    /// `accepts_late`, a world that steps without these paths causes no error.
     fn fly(
         &self,
         py: Python<'_>,
@@ -75,7 +75,7 @@ impl Lease {
         Ok(Some((answer, n_skipped)))
     }
 
-    /// Requests the latest results and frames again. The next paths are for the steps after these.
+    /// Requests the latest results and frames again. The next paths start from the returned steps.
     fn observe(
         &self,
         py: Python<'_>,
@@ -114,7 +114,7 @@ impl Lease {
         Call::new(request, moves, duration(seconds))
     }
 
-    /// Checks that the lease includes these robots. Returns their paths as bytes, or `None` as `moves::paths` does.
+    /// Checks that the lease includes these robots. Returns their paths as bytes, or `None` if `moves::paths` does.
     fn moves(
         &self,
         paths: &Bound<'_, PyAny>,
@@ -131,7 +131,8 @@ impl Lease {
         Ok(moves::paths(paths, n_robots as usize, info.n_moves))
     }
 
-    /// Sends a request while no other thread uses the connection, so that threads never send paths for the same step.
+    /// Sends a request while no other thread uses the connection, so that two threads never send paths for the same
+    /// step.
     fn ask(&self, py: Python<'_>, call: &mut Call<'_>) -> Result<StepAnswer, ConnectionError> {
         let (server, request) = (self.server.get(), *call.request());
         let send = |worlds: &mut Worlds| self.lease.send(worlds.backend(), call);
@@ -150,7 +151,7 @@ impl Lease {
         Ok(answer)
     }
 
-    /// Logs that a step waits for other robots.
+    /// Logs that a step waits for the paths of other robots.
     fn warn_of_wait(&self, py: Python<'_>, first_robot: u32) -> PyResult<()> {
         let world = worlds_of(first_robot, 1, self.server.get().info.n_robots).start;
         let text = format!(

@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 /// The fields of Python's `Merit`.
 type Figures = (Option<u64>, Option<u32>, Option<f64>, Option<f64>, f64);
 
-/// The running figures of several worlds, which step together.
+/// The running figures of merit of several worlds, which step together.
 #[pyclass(module = "emberwatch._native")]
 pub struct MeritTally {
     shape: Shape,
@@ -139,7 +139,8 @@ impl MeritTally {
     }
 }
 
-/// Returns each robot's flight to its end cell. The first flight includes all visited cells, which count for the team.
+/// Returns one flight for each robot, with its end cell. Visited cells count for the whole team, so the first flight
+/// includes all of them.
 fn flights(visited: ArrayView2<'_, bool>, robots: ArrayView2<'_, i64>) -> Vec<Flight> {
     let cells = visited.iter().enumerate().filter(|(_, visited)| **visited);
     let mut all: Vec<usize> = cells.map(|(index, _)| index).collect();

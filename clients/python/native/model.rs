@@ -25,7 +25,7 @@ pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &
     }
 }
 
-/// Returns the fields of a model, read from a model file's text, by name.
+/// Parses the text of a model file, and returns the model's fields by name.
 #[pyfunction]
 pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = model_of(text)?;
@@ -60,14 +60,14 @@ pub fn model_text(path: PathBuf) -> PyResult<String> {
     toml::to_string(&file).map_err(refused)
 }
 
-/// Returns the text of a model file with another sensor radius, in rows and columns beyond the path.
+/// Returns the text of a model file with its sensor radius replaced. The radius is in rows and columns beyond the path.
 #[pyfunction]
 pub fn model_with_radius(text: &str, radius: usize) -> PyResult<String> {
     let model = model_of(text)?.with_radius(radius).map_err(refused)?;
     toml::to_string(model.file()).map_err(refused)
 }
 
-/// Returns the text of a description with another sensor radius.
+/// Returns the text of a description with its sensor radius replaced.
 #[pyfunction]
 pub fn description_with_radius(text: &str, radius: usize) -> PyResult<String> {
     let mut description: Description = toml::from_str(text).map_err(refused)?;

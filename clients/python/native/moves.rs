@@ -9,7 +9,7 @@ use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
 /// Returns paths of `n_moves` moves for `n_robots` robots as bytes. Returns `None` unless they are valid moves in a
-/// plain array of `int64` or `uint8`; then `emberwatch/common/arguments.py` converts them or raises an error.
+/// plain array of `int64` or `uint8`. After `None`, `emberwatch/common/arguments.py` converts them or raises an error.
 pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> Option<Vec<u8>> {
     let expected = (n_robots, n_moves);
     let fast = read::<i64>(given, expected, |value| {
@@ -55,7 +55,7 @@ fn read<T: Element + Copy>(
     (n_robots, n_moves): (usize, usize),
     byte: impl Fn(T) -> u8,
 ) -> Option<Vec<u8>> {
-    // Subclasses of the array type are not plain, because they can mask values.
+    // Subclasses of NumPy's array type do not count as plain arrays, because they can mask values.
     let is_plain = given.get_type().is(PyUntypedArray::type_object(given.py()));
     let array = is_plain.then(|| given.extract::<PyReadonlyArrayDyn<'_, T>>());
     let array = array?.ok()?;

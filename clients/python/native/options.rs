@@ -1,4 +1,4 @@
-//! Options for Python: beliefs about worlds of one robot each, and the plans among which a learner chooses.
+//! Options for Python: beliefs about worlds of one robot each, and the plans that a learner chooses from.
 
 use crate::airspace::Given;
 use crate::belief::first_belief;
@@ -23,7 +23,7 @@ use pyo3::prelude::*;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
-/// Features and paths of plans.
+/// The features and the paths of plans.
 type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);
 
 /// Returns the names of the options, and the names of the features that describe each plan.
@@ -65,10 +65,10 @@ struct Text {
 /// Beliefs about many worlds, and the plans of all options in each.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Options {
-    /// Name of the estimator that keeps the beliefs.
+    /// Name of the estimator that computes the beliefs.
     #[pyo3(get)]
     estimator: String,
-    /// The kind and the model that `prior` is computed from.
+    /// The kind of the first belief, and the model that it is computed from.
     first: (Prior, Model),
     prior: OnceLock<Belief>,
     worlds: Owned<PlannedWorlds>,
@@ -76,8 +76,8 @@ pub struct Options {
 
 #[pymethods]
 impl Options {
-    /// Checks all arguments; [`Self::begin`] starts beliefs. `watched` is the instance in which beliefs are published,
-    /// and the number that the first of these worlds has in that instance.
+    /// Checks all arguments. Beliefs exist only after [`Self::begin`]. `watched` is the instance in which beliefs are
+    /// published, and the number that the first of these worlds has in that instance.
     #[new]
     fn new(
         py: Python<'_>,
@@ -146,7 +146,8 @@ impl Options {
         begun?.map_err(|error| raise(py, &error))
     }
 
-    /// Resumes in a world with the belief that another agent left for the present step. Returns whether it fits.
+    /// Resumes a world's episode with the belief that another agent left for the current step. Returns whether this
+    /// belief fits the estimator.
     fn take_over(&self, py: Python<'_>, world: usize, kind: &str, data: &[u8]) -> PyResult<bool> {
         self.worlds.with(py, |worlds| {
             let planned = worlds.world(world);
@@ -162,7 +163,8 @@ impl Options {
         })
     }
 
-    /// Updates beliefs with an earlier step of `worlds`: bytes of `wire.RESULT_DTYPE`, and frames `[n, H, W]`.
+    /// Updates beliefs with an earlier step of `worlds`: its results, as bytes of `wire.RESULT_DTYPE`, and its frames,
+    /// `[n, H, W]`.
     fn see(
         &self,
         py: Python<'_>,
@@ -180,8 +182,8 @@ impl Options {
         seen?.map_err(|error| raise(py, &error))
     }
 
-    /// Updates beliefs with the present step of `worlds`, then plans all options. Without `frames`, the beliefs already
-    /// include this step. `flown` lists the options that the robots have just flown. Returns features
+    /// Updates beliefs with the current step of `worlds`, then plans all options. If `frames` is `None`, the beliefs
+    /// already include this step. `flown` lists the options that the robots have just flown. Returns features
     /// `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds.
     fn plan<'py>(
         &self,

@@ -22,7 +22,7 @@ pub struct Origin {
     pub shape: Shape,
 }
 
-/// Returns the name and a description of each kind of belief that frames correct.
+/// Returns the name and a description of each kind of belief that is corrected with frames.
 #[pyfunction]
 pub fn belief_kinds() -> Vec<(&'static str, &'static str)> {
     of_frames().map(|kind| (kind.name, kind.about)).collect()
@@ -58,7 +58,8 @@ impl Origin {
             let what = format_args!("the beliefs about {n_worlds} worlds");
             check_memory(py, what, n_worlds.saturating_mul(of_world))
         };
-        // Every kind keeps at least a belief and a predictor. Once built, the first estimator reports its full memory.
+        // Every kind needs memory for at least a belief and a predictor. The first estimator, once built, reports how
+        // much it needs in total.
         memory(2 * n_states * self.shape.n_cells() * size_of::<f32>())?;
         let first = py.detach(|| self.estimator());
         let first = first.map_err(|error| unfit(py, &error))?;
@@ -77,8 +78,8 @@ impl Origin {
         worlds.map_err(|error| unfit(py, &error))
     }
 
-    /// Returns whether a step is too short to divide among threads, as it is for the plain filter or a single world.
-    /// Never true for networks: they use threads themselves, which must be the pool's.
+    /// Returns whether a step is too short to divide among threads, as with the plain filter or a single world. Never
+    /// true for networks, because they divide their own work among threads, and must find the pool's threads there.
     pub fn is_short(&self, n_worlds: usize) -> bool {
         let is_network = [&NEURAL, &NEURAL_SENSOR, &AUTOENCODER].contains(&self.kind);
         *self.kind == KNOWN || (n_worlds <= 1 && !is_network)
@@ -90,7 +91,8 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
     kinds.filter(|kind| kind.input == Input::Frames)
 }
 
-/// Finds a kind of belief by its name or label: among the learned kinds, or among the kinds that only need a model.
+/// Finds a kind of belief by its name or label, either among the learned kinds or among the kinds that need only a
+/// model.
 pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static BeliefKind> {
     let serves =
         |kind: &&BeliefKind| kind.input == Input::Frames && kind.learned_by.is_some() == is_learned;
@@ -104,7 +106,7 @@ pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static B
     Err(invalid(name.py(), "kind", expected, name.repr()?))
 }
 
-/// Makes the error of a prior that is not a valid belief.
+/// Creates the exception for a prior that is not a valid belief.
 pub fn no_prior(py: Python<'_>, error: BeliefError) -> PyErr {
     match error {
         BeliefError::Simplex { cell, got } => {
@@ -115,7 +117,7 @@ pub fn no_prior(py: Python<'_>, error: BeliefError) -> PyErr {
     }
 }
 
-/// Makes the error of a model or a checkpoint from which no belief can be built.
+/// Creates the exception for a model or a checkpoint from which no belief can be built.
 pub fn unfit(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     match error.downcast_ref::<ModelError>() {
         Some(error) => vanishing(py, error),

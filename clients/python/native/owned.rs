@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// Interval at which a thread that waits for another one checks for an interrupt.
+/// Interval at which a thread that waits for another thread checks whether a signal has interrupted it.
 const INTERVAL: Duration = Duration::from_millis(5);
 
 /// A value that does not survive a fork: a server's channels, or worlds and their threads. A forked child gets an error
@@ -28,7 +28,7 @@ enum Slot<T> {
     Closed,
 }
 
-/// A value in use by a thread; dropping this frees the value for other threads.
+/// A guard of a value that a thread is using. Dropping the guard frees the value for other threads.
 struct Taken<'a, T: Send> {
     owner: &'a Owned<T>,
     value: Option<T>,
@@ -44,7 +44,7 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Uses the value while the interpreter is released to other threads.
+    /// Uses the value with the interpreter lock released, so that other threads can run.
     ///
     /// # Errors
     /// If the value is closed, if another process made it, or if the wait for other threads was interrupted.
@@ -69,7 +69,8 @@ impl<T: Send> Owned<T> {
     }
 
     /// Uses the value for short work. Unlike [`Self::with`], keeps the interpreter locked unless another thread uses
-    /// the value. Notices only forks that run Python's hooks: call [`Self::check`] before work that threads share.
+    /// the value. Detects only forks that run Python's hooks, so call [`Self::check`] first if several threads share
+    /// the work.
     ///
     /// # Errors
     /// As for [`Self::with`].
@@ -134,7 +135,8 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits for other threads, then takes the value. Returns `None` if a signal handler raised an exception.
+    /// Waits until no other thread uses the value, then takes it. Returns `None` if a signal handler raised an
+    /// exception.
     fn take(&self) -> Option<Taken<'_, T>> {
         let mut slot = self.lock();
         loop {
@@ -163,7 +165,7 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits for a thread that uses the value, then drops the value. Returns `false` if `stops` ended the wait.
+    /// Waits until no thread uses the value, then drops it. Returns `false` if `stops` ended the wait.
     fn end(&self, stops: fn() -> bool) -> bool {
         let mut slot = self.lock();
         loop {
@@ -211,7 +213,8 @@ impl<T: Send> Drop for Taken<'_, T> {
 impl<T: Send> Drop for Owned<T> {
     fn drop(&mut self) {
         if self.pid == pid() {
-            // Detached, because dropping the value may wait for another thread that needs the interpreter.
+            // Releases the interpreter lock, because dropping the value may wait for another thread that needs this
+            // lock.
             let end = || self.end(|| false);
             if Python::try_attach(|py| py.detach(end)).is_none() {
                 end();
@@ -227,8 +230,8 @@ fn pid() -> u32 {
     std::process::id()
 }
 
-/// Returns the id of this process, with a system call only on the first use. Does not notice a fork that runs without
-/// Python's hooks, so it serves only work in which no other thread of the parent takes part.
+/// Returns the id of this process, with a system call only on the first use. The id is stale after a fork that did not
+/// run Python's hooks, so use it only before work that needs no other threads, which a fork does not copy.
 fn known_pid() -> u32 {
     match PID.load(Ordering::Relaxed) {
         0 => {

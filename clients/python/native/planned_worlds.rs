@@ -29,7 +29,7 @@ pub struct PlannedWorlds {
 /// The channel on which beliefs are published to observers.
 pub struct Watched {
     pub instance: Instance,
-    /// The number, in the instance, of the first world here.
+    /// The instance's number of the first of these worlds.
     pub first_world: u32,
     /// `None` until the first frame, which opens the channel.
     pub feed: Option<Feed>,
@@ -41,9 +41,9 @@ pub struct Observed<'a> {
     pub worlds: &'a [usize],
     /// Bytes of `wire.RESULT_DTYPE`.
     pub results: &'a [u8],
-    /// `[n, H, W]`; `None` if the beliefs include these frames already.
+    /// The frames, `[n, H, W]`; `None` if the beliefs already include them.
     pub frames: Option<&'a [u8]>,
-    /// The option that brought each robot to its cell.
+    /// The option that each robot has just flown.
     pub flown: Option<&'a [usize]>,
 }
 
@@ -55,7 +55,7 @@ struct Row<'a> {
     flown: Option<usize>,
 }
 
-/// The observation of one world, and what to do with it.
+/// The work on one world: its observation, and whether to plan and to publish.
 struct WorldWork<'a> {
     index: usize,
     planned: &'a mut Planned,
@@ -64,7 +64,7 @@ struct WorldWork<'a> {
     is_shown: bool,
 }
 
-/// The published state of a world: the belief after its frame.
+/// The data to publish about a world: its belief after the frame, and the plan.
 struct Outlook {
     index: usize,
     world: WorldResult,
@@ -112,7 +112,7 @@ impl PlannedWorlds {
         Ok(())
     }
 
-    /// Updates beliefs with frames. If `plans` is set, then plans all options.
+    /// Updates beliefs with frames. If `plans` is set, also plans all options.
     ///
     /// # Errors
     /// If the arrays differ in length, a world's number is out of range, or a belief refuses its frame.
@@ -148,7 +148,7 @@ impl PlannedWorlds {
         Ok(())
     }
 
-    /// Returns each world's row among `worlds`, if it has one.
+    /// Returns, for each world here, its index in `worlds`; `None` if it is not listed there.
     fn rows(&self, worlds: &[usize]) -> Result<Vec<Option<usize>>> {
         let mut rows = vec![None; self.worlds.len()];
         for (row, &world) in worlds.iter().enumerate() {
@@ -178,7 +178,7 @@ impl PlannedWorlds {
         (features, paths)
     }
 
-    /// Selects the rows to publish now, among `n_worlds`. The first call opens the channel.
+    /// Returns which of the rows 0 to `n_worlds - 1` to publish now. The first call opens the channel.
     fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
         let begun = self.worlds.iter().flatten().next();
         let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
@@ -289,8 +289,8 @@ impl WorldWork<'_> {
     }
 }
 
-/// Returns whether the work is too short to divide among threads, as it is for a single world. Never true for
-/// networks: they use threads themselves, which must be the pool's.
+/// Returns whether the work is too short to divide among threads, as with a single world. Never true for networks,
+/// because they divide their own work among threads, and must find the pool's threads there.
 fn is_short(crew: &Crew, n_worlds: usize) -> bool {
     n_worlds == 1 && *crew.estimator() != NEURAL
 }

@@ -44,7 +44,7 @@ pub fn beam_search<'py>(
         None => Airspace::open(shape),
         Some(given) => given.on_grid(py, shape)?,
     };
-    // A beam never contains more states than there are paths.
+    // A beam never holds more states than there are paths, 4 to the power of `n_moves`.
     let n_paths = 4_usize.saturating_pow(n_moves as u32);
     check(py, &airspace, n_moves, (width, width.min(n_paths)))?;
     let mut paths = Array2::zeros((n_worlds, n_moves));
@@ -79,7 +79,8 @@ pub fn beam_search<'py>(
     Ok(paths.into_pyarray(py))
 }
 
-/// Returns the values of the cells on a path, or of all cells in sight of it if the sensor pays for seen cells.
+/// Returns the values of cells for the search. A path collects the values of its own cells, or of all cells in sight of
+/// it if the airspace pays for seen cells.
 fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
     match airspace.pays() {
         Pays::Seen => CellValues::in_sight_of(airspace, values),
@@ -87,7 +88,7 @@ fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
     }
 }
 
-/// Checks that the arguments are in range, and that the beam needs no more memory than allowed and available.
+/// Checks that the arguments are in range, and that the beam's memory is within the limit and available.
 fn check(
     py: Python<'_>,
     airspace: &Airspace,
@@ -105,7 +106,7 @@ fn check(
         Pays::Visited => 0,
         Pays::Seen => set_bytes(airspace.radius()),
     };
-    // Each state has two sets of cells, before and after a move, and for each move a link to its predecessor.
+    // Each state has two sets of cells, for before and after a move, and one link per move to the previous state.
     let state_bytes = 2 * (set_bytes(0) + sight_bytes) + n_moves * 8;
     let widest = MAX_WIDTH.min(MAX_BYTES / state_bytes);
     if !(1..=widest).contains(&width) {

@@ -18,7 +18,7 @@ struct Reading<H: Header> {
     observer: Observer<H>,
     /// The only world whose samples are returned; `None` for all worlds.
     world: Option<u32>,
-    /// The next sequence number of each publisher.
+    /// The sequence number that is expected next from each publisher.
     next: HashMap<u32, u64>,
 }
 
@@ -53,7 +53,7 @@ impl<H: Header + Published> Reading<H> {
             };
             let header = &sample.header;
             let next = self.next.insert(header.publisher(), header.sequence() + 1);
-            // A smaller number than expected comes from a new server.
+            // A number below the expected one means that a new server publishes, so nothing was lost.
             n_lost += next.map_or(0, |next| header.sequence().saturating_sub(next));
             if self.world.is_none_or(|world| world == header.world()) {
                 return Ok(Some((sample, n_lost)));

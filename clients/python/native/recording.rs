@@ -69,8 +69,8 @@ fn item(py: Python<'_>, record: Record) -> PyResult<Item<'_>> {
     Ok((record.nanos, kind, value))
 }
 
-/// Makes the error of a file that could not be read. The error's code is "cut" if the recording ends early, "damaged"
-/// if it is damaged, and "recording" for any other file.
+/// Creates the exception for a file that could not be read. Its code is "cut" if the recording ends early, "damaged" if
+/// it is damaged, and "recording" if the file is no recording.
 fn raise(py: Python<'_>, name: &str, problem: RecordingError) -> PyErr {
     let text = format!("{name}: {problem}");
     let code = match problem {

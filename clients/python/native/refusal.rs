@@ -5,7 +5,7 @@ use emberwatch_messages::message::Status;
 use pyo3::prelude::*;
 use std::fmt::Display;
 
-/// Returns the name of a status code and a sentence that explains it; `None` if the code is not that of a refusal.
+/// Returns the name of a refusal's status code and a sentence that explains it; `None` for any other code.
 #[pyfunction]
 pub fn explain(status: u32, detail: u64) -> Option<(String, String)> {
     let status = Status::try_from(status).ok()?;
@@ -14,7 +14,7 @@ pub fn explain(status: u32, detail: u64) -> Option<(String, String)> {
     is_refusal.then_some((name.as_str()?.to_owned(), status.explain(detail)))
 }
 
-/// Makes an `InvalidArgumentError`: "subject: expected ..., got ...".
+/// Creates an `InvalidArgumentError` with the message "subject: expected ..., got ...".
 pub fn invalid(
     py: Python<'_>,
     subject: impl Display,
@@ -25,12 +25,12 @@ pub fn invalid(
     error(py, "invalid", words)
 }
 
-/// Makes an `EmberwatchError` with a code.
+/// Creates an `EmberwatchError` with a code.
 pub fn failed(py: Python<'_>, problem: &str, code: &str) -> PyErr {
     error(py, "EmberwatchError", (problem, code))
 }
 
-/// Makes an `InvalidArgumentError` with this message.
+/// Creates an `InvalidArgumentError` with this message.
 pub fn refused(py: Python<'_>, problem: impl Display) -> PyErr {
     error(py, "InvalidArgumentError", (problem.to_string(),))
 }

@@ -87,7 +87,7 @@ published!(FrameHeader, |_| 0);
 published!(TruthHeader, |_| 0);
 published!(AgentHeader, |header| header.pid);
 
-/// Checks that a sample has this protocol version.
+/// Checks that a sample has the protocol version of this package.
 pub fn check_version(header: &impl Published) -> Result<(), String> {
     match header.version() {
         VERSION => Ok(()),

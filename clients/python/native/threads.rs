@@ -6,7 +6,7 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 /// A thread pool that belongs to one object. A global pool would be unusable after a fork, which copies no threads.
 #[derive(Default)]
 pub struct Pool {
-    /// The process that started the threads.
+    /// The id of the process that started the threads.
     pid: u32,
     threads: Option<ThreadPool>,
 }
@@ -19,8 +19,8 @@ pub enum Threads {
 }
 
 impl Pool {
-    /// Runs `work` on the threads of the pool, which the first call in a process starts. With `is_short`, runs it on
-    /// this thread: sharing such short work would cost more time than it saves.
+    /// Runs `work` on the threads of the pool, which the first call in a process starts. If `is_short` is set, runs it
+    /// on this thread, because sharing such short work would cost more time than it saves.
     pub fn work<R: Send>(&mut self, is_short: bool, work: impl FnOnce(Threads) -> R + Send) -> R {
         if is_short {
             return work(Threads::One);
@@ -32,7 +32,7 @@ impl Pool {
         }
         match &self.threads {
             Some(threads) => threads.install(|| work(Threads::Several)),
-            // The system cannot start more threads.
+            // The system could not start the pool's threads.
             None => work(Threads::One),
         }
     }

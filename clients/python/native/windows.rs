@@ -107,7 +107,7 @@ impl Windows {
     }
 
     /// Updates the maps of the rows marked in `moved`: marks each robot's cell as visited, and clears the world
-    /// channels of all cells whose reward has been paid, because nothing remains to be found there.
+    /// channels of all cells whose reward has been paid, because no reward remains there.
     fn visit(&mut self, flights: &Flights, moved: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let moved = moved.as_array();
         if moved.len() != self.n_rows || flights.cells().len() != self.n_rows {
@@ -159,7 +159,7 @@ impl Windows {
 }
 
 impl Windows {
-    /// Marks the margin and the no-fly cells as off limits.
+    /// Sets the channel of forbidden cells: 255 in the margin and in no-fly cells, 0 elsewhere.
     fn mark_off(&mut self, airspace: &Airspace) {
         let off = self.n_channels - 2;
         let cells = self.maps.iter_mut().skip(off).step_by(self.n_channels);

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import settings
 from processes import at_the_end
 
-# A busy machine is not a bug: only the deadline below applies.
+# Hypothesis must not fail examples that are slow on a busy machine; `DEADLINE` limits the test.
 settings.register_profile("emberwatch", deadline=None)
 settings.load_profile("emberwatch")
 

@@ -1,4 +1,4 @@
-"""Reads PROTOCOL.md: its tables, its fences and its worked example."""
+"""Reads PROTOCOL.md: its tables, its fenced blocks and its worked example."""
 
 import json
 import re

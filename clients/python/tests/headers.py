@@ -1,4 +1,4 @@
-"""Headers of samples as bytes, by the fields that PROTOCOL.md lists."""
+"""Builds headers of samples as bytes, from the fields that PROTOCOL.md lists."""
 
 import document
 

@@ -50,7 +50,7 @@ def unused_instance() -> str:
 
 
 class Program:
-    """One of our programs in a child process, which ends with this process at the latest."""
+    """One of our programs in a child process, which never outlives this process."""
 
     def __init__(self, name: str, *arguments: str) -> None:
         self._output = tempfile.TemporaryFile()
@@ -227,7 +227,7 @@ def _state(pid: int) -> str:
 
 
 def asleep(thread: threading.Thread | int | None = None) -> None:
-    """Waits until a thread or process (default: the main thread) sleeps, as when it waits."""
+    """Waits until a thread or process (default: the main thread) sleeps, so it is waiting."""
     thread = thread or threading.main_thread()
     number = thread if isinstance(thread, int) else thread.native_id
     place = Path(f"/proc/{number}/task/{number}/stat")

@@ -1,4 +1,4 @@
-"""Callers' arguments: arrays of any library, seeds, options, and keywords as in JSON."""
+"""Callers' arguments: arrays of any library, seeds, options, and keyword values as in JSON."""
 
 import os
 from collections.abc import Callable

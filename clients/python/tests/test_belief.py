@@ -34,7 +34,7 @@ def golden(name: str) -> dict[str, NDArray[np.generic]]:
 
 
 def model_of(*, kernel: NDArray, bias: NDArray, matrix: NDArray) -> Model:
-    """Makes a model of any shape through a model file. Five axes mean one kernel per own state."""
+    """Makes a model of any shape. A kernel of five axes begins with the cell's own state."""
     n_states, n_observations = matrix.shape
     lines = ['name = "test"', f"kernel_size = {list(kernel.shape[-2:])}"]
     for s in range(n_states):

@@ -118,7 +118,7 @@ def test_rows_with_other_numbers_of_steps_are_refused(file: Path) -> None:
         go(file, steps=6)
     with refuses("has recent_steps 10 of 'mine' on world 3, expected 2: choose"):
         go(file, recent_steps=2)
-    # Rows of another policy may have other steps.
+    # Rows of another policy may have another number of steps.
     go(file, name="other", steps=6)
     assert len(read(file)) == 6
 
@@ -135,7 +135,7 @@ def test_own_rows_of_older_releases_are_refused(file: Path) -> None:
     assert [row.worlds_fingerprint for row in read(file)] == [""] * 3
     with refuses("has rows of 'mine' from an older release, without a fingerprint of their worlds"):
         go(file)
-    # Rows of other policies stay if their worlds burn alike.
+    # Rows of other policies stay if the same numbers of cells burn in their worlds.
     old = read(file)
     with refuses(r"burning cells in world 3 \('mine'\), got"):
         go(file, name="other", burn_in=61)

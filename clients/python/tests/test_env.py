@@ -65,7 +65,7 @@ def test_the_environment_checker_passes(name: str, keywords: dict[str, Any]) -> 
         env = make(name, **keywords)
         for transition in rollout(env, 30, seed=1):
             assert transition[0] in env.observation_space
-        # Rewards and ends are plain Python.
+        # Rewards and end flags are plain Python values.
         plain = [*transition[1:4], transition[4]["step"]]
         assert [*map(type, plain)] == [float, bool, bool, int]
         more = {"n_target_cells", "n_hits", "truth"} if keywords.get("truth") else set()

@@ -292,7 +292,7 @@ def test_a_neural_belief_can_use_a_known_sensor(checkpoints: Path) -> None:
 
     plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
     shows = MODEL.observation_matrix.T
-    # Except where the inverse of the sensor yields a negative probability, which is clamped.
+    # Beliefs may differ where inverting the sensor gives a negative probability, clamped to 0.
     possible = (noisy.belief > 1e-5).all(0)
     shown = np.tensordot(shows, noisy.belief, 1)
     assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)

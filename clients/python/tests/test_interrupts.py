@@ -35,7 +35,7 @@ pytestmark = pytest.mark.filterwarnings(
 PATH = ("frame", "robot", "age", "belief")
 MOVE = ("frame", "visited", "robot", "move", "age", "belief", "local", "recent")
 
-#: Environments of each kind. Their observations show all that they remember.
+#: Environments of each kind. Their observations show everything that the environments remember.
 KINDS: dict[str, Callable[[], Any]] = {
     "attached": lambda: make(
         instance=small_server(publish_truth=True).instance, observation=PATH, truth=True
@@ -83,7 +83,7 @@ def places(call: Callable[[], object]) -> int:
 
 
 def interrupted(call: Callable[[], object], n: int) -> BaseException | None:
-    """Interrupts a call at its n-th place for signals. Keeps the traceback, as notebooks do."""
+    """Interrupts a call at the n-th signal check. Keeps the traceback, as notebooks do."""
     kind = (KeyboardInterrupt, Alarm)[n & 1]
     sys.setprofile(Signal(n, kind))
     try:
@@ -106,7 +106,7 @@ def action(env: Any, seed: int) -> Any:
 
 @pytest.fixture(autouse=True)
 def no_garbage() -> Generator[None]:
-    """Collects garbage in tracebacks of interrupts now, so that no other test is blamed."""
+    """Collects garbage of interrupted calls now, so that its errors do not fail another test."""
     yield
     gc.collect()
 

@@ -148,7 +148,7 @@ def test_assumed_units_are_reported(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert words in notes(capsys)
 
 
-#: Places of rasters, flags, and words of the error.
+#: Georeferences of rasters, flags, and words of the error.
 NO_PLACE: list[tuple[dict[str, Any], str, str]] = [
     *(
         ({"crs": crs, "cell": (100, 100)}, flags, f"a unit of heights, as cells are in feet, {SAY}")

@@ -218,7 +218,7 @@ tell(lambda: emberwatch.embed(height=5, width=5, moves=4, burn_in=0).acquire())
     assert f"--exit-with {os.getpid()}: pidfd_open: expected the system" in ended.stderr, ended
 
 
-#: Connects with ever more free file descriptors. Prints how many a connection needs.
+#: Connects with ever more free file descriptors. Prints how many descriptors a connection needs.
 DESCRIPTORS = """
 import gc
 def count():

@@ -48,7 +48,7 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
         asleep()
         os.kill(os.getpid(), signal.SIGINT)
         asleep()
-        started.wake_up()  # Ends the close in case the interrupt does not.
+        started.wake_up()  # Ends `close` if the interrupt did not.
 
     thread = threading.Thread(target=interrupt)
     with pytest.raises(KeyboardInterrupt):

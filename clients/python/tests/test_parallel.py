@@ -220,7 +220,7 @@ def test_a_late_path_is_dropped_and_reported() -> None:
         assert set(np.unique(seen["age"])) == {255}
         assert (reward, info["step"], info["n_missed"], info["n_visited"]) == (0.0, 3, 3, 0)
         assert (seen["robot"] == first["robot"]).all() and (seen["frame"] == 255).all()
-        # From this frame on, it flies again.
+        # From this frame on, the robot flies again.
         flown, _ = at_once(lambda: slow.step([0, 0, 0, 0]), lambda: quick.step([1, 1, 1, 1]))
         assert flown[4]["n_missed"] == 0 and flown[4]["step"] == 4 and flown[4]["n_visited"] > 0
         # Missed steps count in the ages.

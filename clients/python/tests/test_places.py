@@ -31,7 +31,7 @@ def test_connect_waits_for_a_server_that_starts_later(caplog: pytest.LogCaptureF
         started = server(instance)
         with waiting.result(2 * PATIENCE) as client:
             assert client.info.pid == started.program.pid
-    # Sleeps once in this test, and once in `server` if its program was slow.
+    # Logged once by this test, and once by `server` if its program was slow.
     assert caplog.text.count("waiting up to 20 s") in (1, 2)
     assert f"no server on instance {instance!r}" in caplog.text
 

@@ -11,7 +11,7 @@ import pytest
 FIRES = Path(__file__).parent / "data" / "fires"
 BENCHMARK = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "filter_benchmark.py"))
 
-#: Bounds on each kind's NLL if all, a tenth or a window of trees are seen: measured + .002.
+#: Bounds on each belief's NLL if all trees, a tenth or a window are seen: measured + .002.
 BOUNDS = {
     "known": (0.026, 0.3065, 0.4435),
     "known+second-order": (0.026, 0.2625, 0.3855),

@@ -75,7 +75,7 @@ def test_a_running_server_describes_its_recorded_world(states: Path) -> None:
                 gymnasium.make(WILDFIRE, instance=instance, **setting)
         env: Any = gymnasium.make(WILDFIRE, instance=instance)
         with warnings.catch_warnings(action="error"):
-            observation, _ = env.reset(seed=0)  # As recorded, there is nothing to find yet.
+            observation, _ = env.reset(seed=0)  # No cell burns yet in the recording.
         assert env.unwrapped.model is None
         assert observation["frame"].shape[:2] == (4, 4)
     with serving() as simulated, emberwatch.connect(simulated) as client:

@@ -71,7 +71,8 @@ def test_a_team_is_evaluated_as_a_whole(tmp_path: Path) -> None:
     shared = evaluate(fly, name="both", robots=2, observation=("robot", "team"), **keywords)
     assert [row.team for row in shared] == ["shared"] * 2
     assert [row.mean_reward for row in shared] == [row.mean_reward for row in rows]
-    # At first they share two cells, then visit two more each. Later they push against the edge.
+    # At first the robots share two cells, then visit two more each. Later they push against the
+    # edge.
     assert all(0.0 < row.mean_repeated < 0.5 for row in rows)
     assert all(row.mean_distinct_cells < 8 for row in rows)
     assert len(emberwatch.benchmark.read(tmp_path / "team.csv")) == 4

@@ -1,4 +1,4 @@
-"""Threads of one process: concurrent forks, work during waits, turns, refused copies."""
+"""Threads of one process: concurrent forks, work during waits, taking turns, refused copies."""
 
 import copy
 import pickle
@@ -85,7 +85,7 @@ def test_open_objects_cannot_be_copied() -> None:
             copied(client)
 
 
-#: Environments, each with the action of all steps.
+#: Environments, each with the action that is repeated in all steps.
 SHARED: dict[str, tuple[Callable[[], Any], Any]] = {
     "path": (make, np.array([1, 3, 1, 3])),
     "moves": (lambda: make_vec(3, MOVES, observation=("belief", "local")), np.array([3, 1, 0])),

@@ -17,11 +17,11 @@ use std::time::Instant;
 
 const CLIENT: ClientId = ClientId { node: 1, pid: 1 };
 
-/// A simulator and its client, with a lease on every robot and the next request.
+/// A simulator, and a client that holds a lease on every robot and prepares the next request.
 struct Session {
     simulator: Simulator,
     request: StepRequest,
-    /// Many random paths, since the CPU would learn to predict the branches of a single repeated path.
+    /// Many random paths, because a CPU learns to predict the branches of a single path that is repeated.
     paths: Vec<Vec<u8>>,
     /// The current step of each world.
     steps: Vec<u64>,

@@ -56,14 +56,14 @@ pub struct ServerConfig {
     pub snapshot_keep: u32,
 }
 
-/// Checked settings, with the loaded model and recorded states that they name.
+/// Checked settings, together with the model and the recorded states that were loaded for them.
 #[derive(Debug, Clone)]
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
     /// Name of the task that set the worlds' settings, if any.
     pub task: Option<String>,
-    /// For recorded worlds, a model without transitions: the states come from the file.
+    /// The model, which has no transitions if the worlds show recorded states.
     pub model: Model,
     pub shape: Shape,
     /// The free cells that robots can reach.
@@ -85,7 +85,7 @@ pub struct CheckedStates {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConfigError {
-    /// An error in a file; `what` is `config file` or `model file`.
+    /// An error in a file. `what` names the kind of file: `config file` or `model file`.
     #[error("{what} {path}: {problem}")]
     File {
         what: &'static str,
@@ -99,8 +99,8 @@ pub enum ConfigError {
         expected: String,
         got: String,
     },
-    /// A setting given by name ([`ServerConfig::with`]) that is unknown or invalid, or that a task or a states file
-    /// determines.
+    /// An error in a setting given by name ([`ServerConfig::with`]): the name is unknown, the value is invalid, or a
+    /// task or a states file already determines the setting.
     #[error("{setting}: expected {expected}, got {got}")]
     Given {
         setting: String,
@@ -154,7 +154,7 @@ impl Default for ServerConfig {
 }
 
 impl ServerConfig {
-    /// Checks every setting and loads the files that they name.
+    /// Checks all settings and loads the files named in them.
     ///
     /// A task replaces every setting that shapes the worlds. A states file replaces the model, the grid and the
     /// burn-in.
@@ -220,7 +220,7 @@ impl ServerConfig {
 
     fn check_ranges(&self) -> Result<(), ConfigError> {
         let settings = self.values();
-        // Recorded states may still replace height and width; `Shape` checks both later.
+        // Skips height and width, because recorded states may still replace them. `Shape` checks both later.
         let bounds = BOUNDS
             .iter()
             .filter(|(it, ..)| !["height", "width"].contains(it));
@@ -300,7 +300,7 @@ impl ServerConfig {
         }
         let path = Path::new(&self.model);
         Model::read(path).map_err(|error| match error {
-            // The path may be a mistyped name of a built-in model.
+            // The missing path may be a mistyped name of a built-in model.
             ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
                 let names = listed(Model::built_in_names());
                 let problem = format!("{problem}: expected a file, or one of {names}");

@@ -26,7 +26,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
-/// The instance name in errors. No server can have this name.
+/// The instance name that errors show. It is not a valid name for a server.
 pub const INSTANCE: &str = "(embedded)";
 
 /// Maximum number of queued file jobs. Each job keeps a whole snapshot in memory.
@@ -110,7 +110,7 @@ impl Embedded {
         }))
     }
 
-    /// Installs the worlds whose reset finished after an interrupted wait, and ends expired leases.
+    /// Prepares for a request: installs worlds whose reset finished since the last call, and ends expired leases.
     fn begin(&mut self, now: Instant) -> Result<(), ConnectionError> {
         if self.is_over {
             return Err(ConnectionError::ServerGone {
@@ -131,7 +131,7 @@ impl Embedded {
             self.reset_threads.spawn(move || {
                 let reset = job.run(&rules);
                 if !rules.ended.load(Ordering::Relaxed) {
-                    // Sending fails after `Embedded` was dropped; the episode is then not needed.
+                    // Sending fails only after `Embedded` was dropped, when nobody needs the episode.
                     drop(sender.send(reset));
                 }
             });
@@ -188,8 +188,8 @@ impl Embedded {
     }
 }
 
-/// Answers requests as a server does. In addition, `control_text` can be interrupted. After a `shutdown` request, every
-/// call fails with [`ConnectionError::ServerGone`].
+/// Answers requests as a server does. Unlike a request to a server, `control_text` can be interrupted. After a
+/// `shutdown` request, every call fails with [`ConnectionError::ServerGone`].
 impl Backend for Embedded {
     fn info(&self) -> &ServerInfo {
         &self.info
@@ -228,7 +228,7 @@ impl Backend for Embedded {
         Ok(serde_json::to_vec(&reply).expect("invariant: replies serialise"))
     }
 
-    /// Ignores the timeout: no other client holds robots of these worlds, so a step never waits.
+    /// Ignores the timeout: a step never waits, because no other client holds robots of these worlds.
     fn step(
         &mut self,
         request: StepRequest,
@@ -277,7 +277,7 @@ pub fn wait_for<T>(
         match receiver.recv_timeout(left.min(INTERVAL)) {
             Ok(next) => return Ok(next),
             Err(RecvTimeoutError::Timeout) if !left.is_zero() => check_interrupt()?,
-            // The time is over, or the job panicked before it sent a value.
+            // The timeout has passed, or the job panicked before it sent a value.
             Err(_) => {
                 return Err(ConnectionError::Timeout {
                     what: "a control request",

@@ -29,8 +29,8 @@ const OF_TASK: [&str; 12] = [
 ];
 
 impl ServerConfig {
-    /// Returns a copy of these settings with the values in `given`. Its keys are the names in `config/server.toml`.
-    /// `start` may also be a text such as `3,5`.
+    /// Returns a copy of these settings with the values in `given`. Its keys are the names in `config/server.toml`. The
+    /// value of `start` may also be a string such as `3,5`.
     ///
     /// # Errors
     /// If a name is unknown, a value is invalid, or a task or recorded states determine the setting.
@@ -55,8 +55,8 @@ impl ServerConfig {
     }
 }
 
-/// Returns a setting's value if it has the type of the default and is within bounds. Otherwise returns the text that
-/// follows "expected" in the error.
+/// Returns a setting's value if it has the type of the default and is within bounds. Otherwise returns what was
+/// expected, for the error.
 fn check(name: &str, value: &Value, default: Option<&Value>) -> Result<Value, String> {
     let fits = match (name, default) {
         (_, None) => {

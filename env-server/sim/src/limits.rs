@@ -9,7 +9,7 @@ use emberwatch_messages::payload::{ROBOT_BYTES, WORLD_BYTES};
 use emberwatch_model::Dynamics;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
-/// Returns the number of threads that step worlds. The same number of threads resets them.
+/// Returns the number of threads that step worlds, which is also the number of threads that reset worlds.
 pub fn n_threads(config: &ServerConfig) -> usize {
     match config.threads {
         0 => std::thread::available_parallelism().map_or(1, usize::from),
@@ -24,14 +24,14 @@ pub fn n_threads(config: &ServerConfig) -> usize {
 pub fn start(pool: ThreadPoolBuilder, n_threads: usize) -> Result<ThreadPool, NoThreads> {
     let started = pool.num_threads(n_threads).build();
     let pool = started.map_err(|error| NoThreads::new(n_threads, &error))?;
-    // A thread's first allocation reserves address space. It must happen before `check_memory` measures the free
-    // address space.
+    // Each thread allocates once, because its first allocation reserves address space and `check_memory` must measure
+    // the free address space after that.
     pool.broadcast(|_| drop(std::hint::black_box(Box::new(0_u8))));
     Ok(pool)
 }
 
 /// Checks that there is memory for all worlds, for the `n_threads` worlds that may be reset at the same time, and for
-/// the longest answer. Call it after these threads have started.
+/// the longest answer. Call this function after the threads have started.
 ///
 /// # Errors
 /// If there is too little memory.
@@ -40,7 +40,7 @@ pub fn check_memory(checked: &Checked, n_threads: usize) -> Result<(), NoMemory>
     let n_at_once = (n_worlds + n_threads.min(n_worlds)) as u64;
     let n_bytes = n_at_once.saturating_mul(bytes_of_world(checked) as u64);
     let n_bytes = n_bytes.saturating_add(answer_bytes(checked) as u64);
-    // An eighth covers the overhead of allocators (measured).
+    // Adds an eighth for the overhead of allocators, which was measured.
     let n_bytes = n_bytes.saturating_add(n_bytes / 8);
     let worlds = if n_worlds == 1 { "world" } else { "worlds" };
     let what = format!("{n_worlds} {worlds} of {} cells", checked.shape);
@@ -74,6 +74,6 @@ fn bytes_of_world(checked: &Checked) -> usize {
     } else {
         0
     };
-    // 3 bytes per cell: visit counts and the scratch buffers of flights.
+    // The 3 bytes per cell are for the visit counts and the scratch buffers of flights.
     of_states + 3 * n_cells + robots + history + whole_frames
 }

@@ -1,8 +1,7 @@
 //! States files: recorded hidden states as NumPy arrays, with a description. See docs/recorded-worlds.md.
 //!
 //! An array's header is checked before its values are read or decompressed. The allocated memory grows with the bytes
-//! that are present, not with the size that a header claims. The values of an array are not copied after they were
-//! read.
+//! that are present, not with the size that a header claims. Once read, the values of an array are not copied again.
 
 use emberwatch_model::built_in::STATES;
 use emberwatch_model::grid::Shape;
@@ -21,8 +20,8 @@ use zip::ZipArchive;
 /// Maximum size of all arrays together: 4 GiB.
 pub const MAX_BYTES: u64 = 1 << 32;
 
-/// Maximum length of an array's header. NumPy writes 128 bytes. Nested brackets in a long header could overflow the
-/// parser's stack.
+/// Maximum length of an array's header. Headers written by NumPy have 128 bytes. Longer ones are refused, because many
+/// nested brackets could overflow the parser's stack.
 const MAX_HEADER_BYTES: usize = 512;
 
 /// Maximum length of the end record of a zip archive: 22 bytes and a comment.
@@ -293,7 +292,8 @@ fn add_file(sequences: &mut Sequences, path: &Path) -> Result<(), String> {
     }
 }
 
-/// Returns the length of a regular file. Opening a pipe instead would wait for a writer.
+/// Returns the length of a file, or an error if it is not a regular file: opening a pipe would block until it has a
+/// writer.
 fn check_regular(path: &Path) -> Result<u64, String> {
     let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
     if metadata.is_file() {
@@ -303,9 +303,9 @@ fn check_regular(path: &Path) -> Result<u64, String> {
     }
 }
 
-/// Reads the number of entries from the end record of an archive. `ZipArchive` keeps only one entry per name, so its
-/// number of entries is smaller if names are duplicated. Returns `None` if there is no end record or its 16-bit count
-/// is saturated.
+/// Reads the number of entries from the end record of an archive. This reveals duplicate names: `ZipArchive` keeps only
+/// one entry per name, so it reports fewer entries. Returns `None` if there is no end record, or if its 16-bit count is
+/// saturated.
 fn n_entries(archive: &mut (impl Read + Seek)) -> std::io::Result<Option<usize>> {
     let n_bytes = archive.seek(SeekFrom::End(0))?;
     archive.seek(SeekFrom::Start(n_bytes.saturating_sub(MAX_ZIP_END_BYTES)))?;
@@ -357,7 +357,7 @@ fn read_header(from: &mut impl Read) -> Result<Header, String> {
         .map_err(|error| format!("expected a NumPy array: {error}"))
 }
 
-/// Checks a header against the `n_values` bytes that follow it, and returns the axes of the array.
+/// Checks that an array's header fits the `n_values` bytes after it, and returns the lengths of the array's axes.
 fn checked_dim(header: &Header, n_values: u64) -> Result<Dim, String> {
     let dtype = &header.type_descriptor;
     if !matches!(

@@ -41,7 +41,8 @@ fn every_task_has_its_row() {
             "| `{name}` | `{ids}` | `{world}` | {shape} | {moves} | {steps} | {first} to {last} |"
         )
     });
-    // In the third column, words follow the model or the states. The sixth says "up to" for recorded episodes.
+    // Removes what is only in the documents: words after the model or the states in the third column, and "up to" in
+    // the sixth column of recorded worlds.
     let documented = rows("| task | ids begin with |").into_iter().map(|row| {
         let mut cells: Vec<&str> = row.split(" | ").collect();
         let world = cells[2].split_inclusive('`').take(2).collect::<String>();
@@ -82,7 +83,7 @@ fn every_setting_is_explained_with_its_range() {
             .flat_map(str::split_whitespace)
             .filter(|word| *word != "#");
         let words = words.collect::<Vec<_>>().join(" ");
-        // The document explains a radius of -1 in words.
+        // The documented range of the radius starts at 0, because the document explains -1 in words.
         let range = format!("{} to {most}", least.max(0));
         assert!(
             words.contains(&range),

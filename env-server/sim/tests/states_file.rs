@@ -1,4 +1,4 @@
-//! States files as NumPy writes them, and the error for each kind of broken file.
+//! Tests of states files: files in the form in which NumPy writes them, and the error for each kind of broken file.
 
 use emberwatch_model::built_in::state_names;
 use emberwatch_sim::config::ServerConfig;
@@ -26,7 +26,8 @@ observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#
 /// A valid header of an array.
 const HEADER: &str = "{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4), }\n";
 
-/// Rows of `part of the header => its replacement => the expected error`.
+/// its replacement => the expected error`. => Rows of three fields: `part of the header => its replacement => the
+/// expected error`. => its replacement => the expected error`.
 const WRONG_HEADERS: &str = "
 |u1 => <f4 => expected dtype '|u1' (uint8), got '<f4'
 |u1 => |i1 => expected dtype '|u1' (uint8), got '|i1'
@@ -105,7 +106,8 @@ fn archives_stored_or_deflated_are_read_in_the_order_of_names() {
         sequence(2, (9, 3, 4)),
     ];
     let [first, second, third] = sequences.each_ref().map(npy);
-    // Python sorts names without `.npy`: "a" before "a-b". With the ending, "a-b.npy" would come before "a.npy".
+    // Python sorts the names without `.npy`, so "a" comes before "a-b". With the ending, "a-b.npy" would come before
+    // "a.npy".
     let members = [("b.npy", third), ("a.npy", first), ("a-b.npy", second)];
     let mut checksums = Vec::new();
     for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
@@ -217,7 +219,7 @@ fn broken_archives_are_refused_each_by_its_problem() {
     while let Some(at) = twice.windows(7).position(|name| name == b"two.npy") {
         twice[at..at + 7].copy_from_slice(b"one.npy");
     }
-    // Two members claim 3 GiB each but contain less: claimed sizes must not be allocated.
+    // Two members claim 3 GiB each but contain less. Memory must not be allocated for the claimed sizes.
     let header = HEADER.replace("(2, 3, 4)", "(196608, 128, 128)");
     let bytes = npy_with(&header);
     let claimed = (3_u32 << 30) + 10 + header.len() as u32;

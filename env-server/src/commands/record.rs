@@ -10,7 +10,7 @@ use std::path::PathBuf;
 /// Records the frames that an instance publishes to a file.
 #[derive(Args)]
 pub struct RecordCommand {
-    /// Instance name of the server, which may start later and restart
+    /// Instance name of the server; the server may start later and may restart
     #[arg(long, default_value = "default")]
     instance: String,
     /// The file to write

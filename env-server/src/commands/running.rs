@@ -36,7 +36,7 @@ struct Target {
     json: bool,
 }
 
-/// The answer to `status`, and the name of the task that defines the worlds, if any.
+/// The answer to `status`, together with the name of the task that defines the worlds, if any.
 #[derive(Serialize)]
 struct NamedStatus<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -69,7 +69,7 @@ impl StopCommand {
 }
 
 impl Target {
-    /// Sends a request. Returns the server's description and its reply.
+    /// Sends a request. Returns the server's description, from the handshake, and its reply.
     fn ask(&self, request: &Request) -> Result<(ServerInfo, Reply)> {
         let instance = Instance::new(&self.instance)?;
         let mut connection = Connection::open(&instance, "emberwatch-server", TIMEOUT)?;

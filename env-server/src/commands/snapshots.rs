@@ -10,7 +10,7 @@ use emberwatch_sim::snapshot::read;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// How long to wait for the server. Files may be large, and worlds may be in their burn-in.
+/// How long to wait for the server. This is long, because files may be large and worlds may be in their burn-in.
 const TIMEOUT: Duration = Duration::from_secs(120);
 
 /// Writes worlds to a file. This needs no lease.
@@ -43,7 +43,7 @@ pub struct RestoreCommand {
     /// The first of the file's worlds to read
     #[arg(long, default_value_t = 0)]
     from: u32,
-    /// Number of worlds to read [default: the first of them and all later ones in the file]
+    /// Number of worlds to read [default: the first one and all later ones in the file]
     #[arg(long)]
     worlds: Option<u32>,
     /// Take over robots that other clients hold
@@ -132,7 +132,7 @@ impl ForkCommand {
     }
 }
 
-/// Sends a request that replaces worlds, under a temporary lease on all their robots.
+/// Acquires a temporary lease on all robots of the worlds and sends a request that replaces these worlds.
 fn replace(
     server: Connection,
     worlds: std::ops::Range<u32>,

@@ -1,12 +1,14 @@
-//! The times at which the samples of a recording are published. Pure functions: the current time is an argument.
+//! The times at which the samples of a recording are published. The functions here are pure: the current time is an
+//! argument.
 
 use emberwatch_protocol::channels::FRAME_BUFFER;
 use std::time::{Duration, Instant};
 
-/// Maximum number of samples published without a pause. Two bursts fit into an observer's buffer.
+/// Maximum number of samples published without a pause. An observer's buffer has space for two such bursts.
 const BURST: usize = FRAME_BUFFER / 2;
 
-/// Minimum time between the beginnings of two bursts: observers poll every 500 us, and the machine may be busy.
+/// Minimum time between the beginnings of two bursts. It leaves a margin for busy machines, because observers poll
+/// every 500 us.
 const BURST_TIME: Duration = Duration::from_millis(1);
 
 /// The pace of a replay.
@@ -19,7 +21,8 @@ pub struct Pace {
 }
 
 impl Pace {
-    /// Creates the pace of a replay that begins now. Without a speed, it is as fast as observers can follow.
+    /// Creates the pace of a replay that begins now. If `speed` is `None`, the replay is as fast as observers can
+    /// follow.
     pub fn new(speed: Option<f64>, now: Instant) -> Self {
         Self {
             speed: speed.unwrap_or(f64::INFINITY),
@@ -34,14 +37,15 @@ impl Pace {
         self.round_began = now;
     }
 
-    /// Returns the time at which this time of the recording is due, or `None` if it is too late to represent.
+    /// Converts a time in the recording to the time at which its sample is due, or `None` if that is too late to
+    /// represent.
     pub fn due(&self, time: Duration) -> Option<Instant> {
         let after = Duration::try_from_secs_f64(time.as_secs_f64() / self.speed).ok()?;
         self.round_began.checked_add(after)
     }
 
-    /// Returns the time until which the next sample must wait so that observers can follow, or `None` if it need not
-    /// wait.
+    /// Returns the earliest time at which the next sample may be published so that observers can follow, or `None` if
+    /// it need not wait.
     pub fn pause(&self) -> Option<Instant> {
         (self.n_in_burst == BURST).then(|| self.burst_began + BURST_TIME)
     }

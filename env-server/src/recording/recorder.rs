@@ -1,9 +1,10 @@
 //! An observer that records what an instance publishes.
 //!
 //! One thread reads the channels without delay; another compresses and writes. Gaps in the sequence numbers reveal lost
-//! samples, whose number is stored in each record and in the end record.
+//! samples. Their number is stored in the next record, and their total in the end record.
 //!
-//! In a file, a frame of 64 x 64 cells with its path of 64 moves takes about 150 bytes, and its hidden states take 650.
+//! In a file, a frame of 64 x 64 cells with its path of 64 moves takes about 150 bytes, and the hidden states of the
+//! same step take 650 bytes.
 
 use anyhow::{Context, Result};
 use emberwatch_protocol::Connection;
@@ -31,7 +32,8 @@ const TICK: Duration = Duration::from_millis(50);
 /// Time between flushes, so that every record reaches the operating system within a second.
 const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Maximum wait for the answer to `hello`. A server that does not answer publishes nothing either.
+/// Maximum wait for the answer to `hello`. No samples are lost meanwhile, because a server that does not answer
+/// publishes nothing either.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Pause before another `hello` to a server that did not answer.
@@ -76,9 +78,10 @@ pub struct RecordSummary {
 /// # Errors
 /// If the file cannot be written or the instance cannot be observed. Earlier records remain in the file.
 pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummary> {
-    // Sends `hello` before observing: during the wait, a fast agent would overflow an observer's buffer.
+    // Sends `hello` before it starts to observe, because a fast agent would overflow the observer's buffer during the
+    // wait for the answer.
     let first_server = Connection::open(&options.instance, NAME, HELLO_TIMEOUT);
-    // Observes the hidden states first, so that they are recorded for every recorded frame.
+    // Starts to observe the hidden states before the frames, so that every recorded frame has its hidden states.
     let truths = options
         .truth
         .then(|| Observer::truth(&options.instance))
@@ -120,15 +123,15 @@ struct Recorder<'a> {
     options: &'a RecordOptions,
     writing: Writing,
     began: Instant,
-    /// The answer to the `hello` sent before the first sample.
+    /// The answer to the `hello` that was sent before the first sample arrived.
     first_server: Option<ServerInfo>,
     /// The server process whose samples are being recorded.
     server: Option<u32>,
-    /// A server process that did not answer `hello`, and when it was asked.
+    /// A server process that did not answer `hello`, and the time at which it was asked.
     silent: Option<(u32, Instant)>,
     frames: Channel,
     truths: Channel,
-    /// Episode and step of each world's latest frame, needed because frames may be published repeatedly.
+    /// Episode and step of each world's latest frame, to detect frames that are published repeatedly.
     steps: HashMap<u32, (u64, u64)>,
     n_steps: u64,
     n_unknown: u64,
@@ -152,8 +155,8 @@ impl Recorder<'_> {
         }
     }
 
-    /// Waits for a frame, and records it after the hidden states that were published before it. Returns whether a frame
-    /// arrived.
+    /// Waits for a frame. Records first the hidden states that were published before the frame, and then the frame.
+    /// Returns whether a frame arrived.
     fn run_once(
         &mut self,
         frames: &Observer<FrameHeader>,
@@ -196,7 +199,8 @@ impl Recorder<'_> {
         self.push(world, n_lost, Event::Frame(sample));
     }
 
-    /// Returns whether the server of a sample is known. Asks a new server for its description and records it.
+    /// Returns whether the server of a sample is known. If the server is new, first asks it for its description and
+    /// records this.
     fn knows(&mut self, publisher: Option<u32>, is_new: bool) -> bool {
         if publisher.is_some() && publisher == self.server && !is_new {
             return true;
@@ -298,7 +302,7 @@ impl Recorder<'_> {
 }
 
 impl Channel {
-    /// Returns whether a sequence number is too low to come from the same server.
+    /// Returns whether a sequence number shows that a new server has started, because it is lower than expected.
     fn is_new(&self, sequence: u64) -> bool {
         self.next.is_some_and(|next| sequence < next)
     }
@@ -341,7 +345,7 @@ impl Writing {
         })
     }
 
-    /// Queues a record. Waits while the queue is full. The observer may lose samples meanwhile, which are counted.
+    /// Queues a record, and waits while the queue is full. Samples that the observer loses during the wait are counted.
     fn push(&self, record: Record) {
         while self.n_queued_bytes.load(Ordering::Relaxed) > MAX_QUEUED_BYTES && self.is_running() {
             std::thread::sleep(Duration::from_millis(1));
@@ -403,7 +407,7 @@ fn create(path: &Path, overwrite: bool) -> std::io::Result<File> {
     file_options.write(true).mode(0o600);
     let found = path.metadata().ok().filter(|_| overwrite);
     let file = match found.map(|found| found.is_file()) {
-        // Replaces the file instead of truncating it: other programs may have the old one open.
+        // Replaces the file instead of truncating it, because other programs may have the old file open.
         Some(true) => path.canonicalize().and_then(|path| {
             std::fs::remove_file(&path)?;
             file_options.create_new(true).open(path)

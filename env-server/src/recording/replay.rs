@@ -3,9 +3,10 @@
 //! The file is read twice: first to check it completely before anything is published, then to publish it.
 //!
 //! By default a replay begins with the first observer and keeps the recorded timing. At any speed it publishes at most
-//! 64 samples within a millisecond, so an observer that polls every 500 us loses none. Nothing is published twice: a
-//! late observer receives each world from its next sample on. At its end, a replay waits up to 3 s for its observers to
-//! leave. When a replay repeats, sequence numbers start again, as with a new server.
+//! 64 samples within a millisecond, so an observer that polls every 500 us loses none. No sample is published twice, so
+//! a late observer receives a world only when the recording contains its next sample. At its end, a replay waits up to
+//! 3 s for its observers to leave. When a replay restarts at its end, the sequence numbers start again, as with a new
+//! server.
 
 use super::pace::Pace;
 use super::replies::{ConnectionCounts, Next, ReplayState};
@@ -79,10 +80,10 @@ pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
     outcome
 }
 
-/// The message sizes, the first server and the totals of the whole file.
+/// A summary of the whole file: the message sizes, the description of the first server, and the totals.
 struct RecordingSummary {
     config: PortConfig,
-    /// The first server in the file.
+    /// The description of the first server in the file.
     info: ServerInfo,
     totals: Totals,
 }
@@ -183,7 +184,7 @@ impl Playback<'_> {
         Ok(())
     }
 
-    /// Waits until a time of the recording is due and observers can follow.
+    /// Waits until the samples at a time in the recording are due and observers can follow.
     fn wait_until_due(&mut self, time: Duration) -> Result<()> {
         let due = self.pace.due(time);
         let mut now = Instant::now();
@@ -212,7 +213,7 @@ impl Playback<'_> {
         self.is_over || self.stop.load(Ordering::Relaxed)
     }
 
-    /// Answers requests until a time or the end of the replay.
+    /// Answers requests until the given time or the end of the replay.
     fn serve_until(&mut self, until: Instant) -> Result<()> {
         loop {
             self.ports.connect_observers();

@@ -14,7 +14,7 @@ use std::time::Instant;
 const REFUSAL: &str =
     "this instance replays a recording: it can be observed but accepts no actions";
 
-/// The server and worlds that a replay has published so far.
+/// The description of the server and the states of the worlds that a replay has published so far.
 pub struct ReplayState {
     info: ServerInfo,
     has_truth: bool,
@@ -32,7 +32,7 @@ pub struct ConnectionCounts {
     pub n_observers: usize,
 }
 
-/// Whether the replay continues after an answer.
+/// Whether the replay continues after it has answered a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Next {
     Continue,

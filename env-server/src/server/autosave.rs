@@ -1,8 +1,8 @@
 //! The automatic snapshots of a server, and the snapshot that it starts with.
 //!
-//! All automatic snapshots survive the death of any process. Some also survive a loss of power: the first one, each one
-//! that is due at least five seconds after the previous such snapshot, and the server's last one. The newest of these
-//! is kept in addition to the last few snapshots.
+//! All automatic snapshots survive the death of any process. Some also survive a loss of power: the first snapshot,
+//! each snapshot at least five seconds after the previous one of this kind, and the server's last snapshot. The newest
+//! snapshot of this kind is kept in addition to the last few snapshots.
 
 use super::files::Files;
 use emberwatch_protocol::throttle::Throttle;
@@ -16,7 +16,8 @@ use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Minimum time between two snapshots that survive a loss of power, because waiting for the disk delays steps.
+/// Minimum time between two snapshots that survive a loss of power. They are rare, because waiting for the disk delays
+/// steps.
 const SYNC_INTERVAL: Duration = Duration::from_secs(5);
 
 /// The schedule and the folder of automatic snapshots.
@@ -25,7 +26,7 @@ pub struct Autosave {
     keep: usize,
     /// Number of world steps between two snapshots.
     every: u64,
-    /// Number of world steps at which the next snapshot is due.
+    /// Total number of world steps at which the next snapshot is due.
     due: u64,
     /// The job that is currently writing a snapshot.
     writing: Option<(u64, Durability)>,
@@ -35,7 +36,7 @@ pub struct Autosave {
 }
 
 impl Autosave {
-    /// Prepares the snapshots that the settings ask for, or returns `None` if they ask for none.
+    /// Prepares automatic snapshots, or returns `None` if the settings do not enable them.
     ///
     /// # Errors
     /// If the folder is not writable, or contains snapshots of an earlier run although `restore` is not set.
@@ -62,8 +63,8 @@ impl Autosave {
         }))
     }
 
-    /// Returns whether a snapshot is due after `n_steps` world steps. On a slow disk, snapshots are skipped: the next
-    /// one is due only after the previous one was written.
+    /// Returns whether a snapshot is due after `n_steps` world steps. The next snapshot is due only after the previous
+    /// one was written, so a slow disk makes snapshots rarer.
     pub fn is_due(&self, n_steps: u64) -> bool {
         n_steps >= self.due && self.writing.is_none()
     }
@@ -111,8 +112,8 @@ impl Autosave {
     }
 }
 
-/// Returns what the next snapshot must survive. `age` is the time since the latest snapshot that survives a loss of
-/// power.
+/// Returns which failures the next snapshot must survive. `age` is the time since the latest snapshot that survives a
+/// loss of power.
 fn durability(age: Option<Duration>, is_last: bool) -> Durability {
     match age {
         Some(age) if age < SYNC_INTERVAL && !is_last => Durability::Kill,
@@ -170,8 +171,8 @@ pub fn first_worlds(checked: &Checked, spec: &WorldSpec) -> Result<Option<FirstW
     damaged.map_or(Ok(None), Err)
 }
 
-/// Logs why no snapshot of a folder is restored. An empty folder is normal at the first start. Snapshots of other
-/// instances are worth a warning, because the user may have meant them.
+/// Logs why no snapshot is restored from a folder. An empty folder is normal at the first start. If the folder contains
+/// only snapshots of other instances, logs a warning, because the user may have meant one of these.
 fn log_why_none(folder: &Folder, path: &Path) {
     let (path, expected) = (path.display(), folder.pattern());
     match &folder.snapshots()[..] {

@@ -6,14 +6,14 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
-/// The receiving end: results of other threads.
+/// The receiving end of the channel.
 pub struct Completions<T> {
     pub results: Receiver<T>,
-    /// Readable while `results` may not be empty.
+    /// A descriptor that is readable if `results` may contain something.
     signal: Arc<OwnedFd>,
 }
 
-/// The sending end, for another thread.
+/// The sending end of the channel, for use in another thread.
 pub struct CompletionSender<T> {
     results: Sender<T>,
     signal: Arc<OwnedFd>,

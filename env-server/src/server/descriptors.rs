@@ -1,11 +1,13 @@
-//! The limit on file descriptors. iceoryx2 opens several for each client and observer. If none are left, a new client
-//! gets no answer at all. So a server starts only if the limit is high enough for all clients and observers.
+//! The limit on file descriptors. iceoryx2 opens several descriptors for each client and observer. If none are left, a
+//! new client gets no answer at all. So a server starts only if the limit is high enough for the maximum number of
+//! clients and observers.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use thiserror::Error;
 
-/// Minimum limit for a server with all clients and observers, with a reserve. Measured: 40 for the server, 10 for each
-/// of 16 clients and up to 8 more if its requests grow, 1 for each of 16 observers and 4 readers of hidden states.
+/// Minimum limit for a server with the maximum number of clients and observers, with a reserve. According to
+/// measurements, the server needs 40 descriptors, each of 16 clients 10 (up to 8 more if its requests grow), and each
+/// of 16 observers and 4 readers of hidden states 1.
 const NEEDED: u64 = 512;
 
 /// The error for a limit that is too low for all clients and observers.
@@ -27,7 +29,7 @@ pub fn raise_limit() -> Result<(), TooFewDescriptors> {
     setrlimit(Resource::Nofile, raised).map_err(|_| TooFewDescriptors { got })
 }
 
-/// Returns the limits to set, or `None` if the given ones are high enough.
+/// Returns the limits to set, or `None` if the current limits are high enough.
 fn enough(limits: Rlimit) -> Result<Option<Rlimit>, TooFewDescriptors> {
     let is_enough = |limit: Option<u64>| limit.is_none_or(|limit| limit >= NEEDED);
     match limits.maximum {

@@ -52,8 +52,8 @@ impl Files {
         self.n_jobs
     }
 
-    /// Returns whether another job can be queued. A job counts until it is done, even if its client has stopped
-    /// waiting.
+    /// Returns whether another job can be queued. A job occupies the queue until it is done, even if its client has
+    /// stopped waiting.
     pub fn has_capacity(&self) -> bool {
         self.n_jobs - self.n_done < MAX_JOBS
     }

@@ -12,11 +12,12 @@ use std::os::fd::BorrowedFd;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Maximum number of known nodes. A full table is emptied. This bounds the memory that a reconnecting client can use.
+/// Maximum number of known nodes. A full table is emptied, so that a client that reconnects again and again cannot use
+/// more and more memory.
 const MAX_KNOWN_NODES: usize = 1024;
 
-/// The watched processes of clients and observers. When one has died, a thread removes its files, which takes
-/// milliseconds and must not delay steps.
+/// The processes of clients and observers, which are watched. When one has died, a separate thread removes its files,
+/// because this takes milliseconds and must not delay steps.
 #[derive(Default)]
 pub struct Clients {
     nodes: HashMap<u128, u32>,
@@ -32,7 +33,7 @@ impl Clients {
         if let Some(&pid) = self.nodes.get(&node) {
             return ClientId { node, pid };
         }
-        // PROTOCOL.md section 1 defines the content of a node id.
+        // The upper bits of a node id contain the process id (PROTOCOL.md, section 1).
         let pid = (node >> 64) as u32;
         if self.nodes.len() == MAX_KNOWN_NODES {
             self.nodes.clear();
@@ -48,8 +49,8 @@ impl Clients {
         self.processes.values().map(WatchedProcess::descriptor)
     }
 
-    /// Returns the processes of `nodes` and of clients that have ended since the last call. Stops watching them and
-    /// removes their files.
+    /// Returns the process ids of clients and of `nodes` whose process has ended since the last call. Stops watching
+    /// these processes and removes their files.
     pub fn take_dead(&mut self, nodes: &HashSet<u128>) -> Vec<u32> {
         for &node in nodes {
             self.identify(node);
@@ -85,7 +86,7 @@ impl Clients {
         }
         match WatchedProcess::open(i32::try_from(pid).unwrap_or(0)) {
             Ok(process) => self.processes.insert(pid, process).is_none(),
-            // The process has already ended. Its lease will expire.
+            // The process has already ended, so it cannot be watched. Its lease will expire.
             Err(Errno::SRCH) => {
                 self.is_cleanup_due = true;
                 true
@@ -107,7 +108,7 @@ impl Clients {
 fn clean_up() {
     match remove_leftovers() {
         Ok(n_files) => tracing::debug!(n_files, "removed files of dead processes"),
-        // The next program that starts tries again.
+        // Ignored, because the next program that starts tries again.
         Err(error) => tracing::debug!("could not remove files of dead processes: {error}"),
     }
 }

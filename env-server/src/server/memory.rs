@@ -1,6 +1,6 @@
-//! Shared memory for a server's messages. A server starts only if there is enough for all clients and observers. The
-//! memory is allocated when they connect. So a few clients use little memory, and the server never writes to memory
-//! that the system cannot supply.
+//! Shared memory for a server's messages. A server starts only if there is enough for the maximum number of clients and
+//! observers. The memory of each one is allocated when it connects. So a few clients use little memory, and the server
+//! never writes to memory that the system cannot supply.
 
 use super::port_config::PortConfig;
 use anyhow::{Result, anyhow};
@@ -14,11 +14,11 @@ use emberwatch_protocol::shared_memory::MessageMemory;
 /// Maximum overhead of iceoryx2 per message, in bytes.
 const MESSAGE_OVERHEAD: usize = 512;
 
-/// Shared memory of fixed size, in bytes: control messages, events and tables.
+/// Size in bytes of the shared memory that does not depend on the settings: control messages, events and tables.
 const FIXED_BYTES: u64 = 8 << 20;
 
-/// Number of answers that iceoryx2 reserves per client: for each of 2 requests, one buffered, one borrowed and one
-/// loaned.
+/// Number of answers for which iceoryx2 reserves memory per client: three for each of 2 requests (one buffered, one
+/// borrowed and one loaned).
 const ANSWERS: usize = 2 * 3;
 
 /// The shared memory for the messages of a server's ports.
@@ -76,8 +76,8 @@ impl PortMemory {
     }
 }
 
-/// Returns the maximum number of samples in use. Each subscriber uses a full buffer and the sample that it is reading.
-/// The publisher uses the last sample and the next one.
+/// Returns the maximum number of samples that exist at once. Each subscriber can occupy a full buffer and the sample
+/// that it is reading. The publisher occupies the last sample and the next one.
 fn samples(n_subscribers: usize, buffer: usize) -> usize {
     n_subscribers * (buffer + 1) + 2
 }

@@ -84,8 +84,8 @@ impl Server {
         }
     }
 
-    /// Drops requests whose clients have stopped waiting. Before this, iceoryx2 delivers no new requests from such a
-    /// client.
+    /// Drops requests whose clients have stopped waiting. This must be done, because iceoryx2 delivers no new requests
+    /// from such a client before.
     pub(super) fn cancel_abandoned(&mut self, now: Instant) {
         let simulator = &mut self.simulator;
         self.waiting_steps.retain(|(ticket, request)| {

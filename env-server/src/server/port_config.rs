@@ -19,7 +19,7 @@ pub struct PortConfig {
 }
 
 impl PortConfig {
-    /// Returns the sizes of an instance without worlds.
+    /// Returns the message sizes of an instance without worlds.
     pub fn empty(instance: Instance) -> Self {
         Self {
             instance,

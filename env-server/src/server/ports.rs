@@ -59,7 +59,8 @@ pub struct Ports {
     truth_service: Option<TruthService>,
     entries: Entries,
     _node: Node<Ipc>,
-    /// Dropped last, so that all other fields are dropped, and their files removed, during this turn.
+    /// The lock for removing ports. It is dropped last, so that it is held while the other fields are dropped and their
+    /// files removed.
     end: Option<Turn>,
 }
 
@@ -149,8 +150,8 @@ impl Ports {
         self.entries.check_at(Instant::now())
     }
 
-    /// Closes the ports and removes their files. If the files were removed before, files with the same names belong to
-    /// another server, so they are left alone.
+    /// Closes the ports and removes their files. If the files have already been removed by someone else, files with
+    /// these names belong to another server and are kept.
     pub fn close(self) {
         if self.entries.check().is_err() {
             std::mem::forget(self);
@@ -167,8 +168,8 @@ impl Ports {
         received(self.control.receive(), &self.failed_connections)
     }
 
-    /// Returns the reply. Replaces a reply to `hello` with a refusal if there is no memory for answers to another
-    /// client.
+    /// Returns the reply unchanged, except that a reply to `hello` becomes a refusal if there is no memory for answers
+    /// to another client.
     pub fn with_memory(&self, reply: Reply) -> Reply {
         let n_clients = self.control_service.dynamic_config().number_of_clients();
         match (
@@ -256,7 +257,7 @@ impl Ports {
 
     /// Connects to new observers and disconnects from those that have left.
     pub fn connect_observers(&self) {
-        // If connecting to one observer fails, only that observer receives nothing.
+        // Errors are ignored: if connecting to one observer fails, only that observer receives nothing.
         let _ = self.frames.update_connections();
         let _ = self
             .truth

@@ -1,4 +1,4 @@
-//! Publishes each world after its step, and all worlds when an observer connects.
+//! Publishes a world after each of its steps, and all worlds when an observer connects.
 
 use super::ports::Ports;
 use emberwatch_protocol::channels::FRAME_BUFFER;
@@ -12,7 +12,7 @@ use std::ops::Range;
 #[derive(Default)]
 pub struct Publications {
     observers: Vec<u128>,
-    /// Worlds that new observers have not received yet.
+    /// Worlds still to be published for new observers.
     for_new: Range<usize>,
     n_frames: u64,
     n_truths: u64,
@@ -25,12 +25,12 @@ impl Publications {
         !self.for_new.is_empty()
     }
 
-    /// Publishes the next worlds for new observers, until all are published.
+    /// Publishes the next batch of worlds for new observers, if some are left.
     pub fn publish_to_new(&mut self, ports: &Ports, simulator: &Simulator) {
         let observers = ports.observer_ids();
         let has_new = observers.iter().any(|id| !self.observers.contains(id));
         if observers != self.observers {
-            // Also disconnects observers that have left.
+            // This also disconnects observers that have left.
             ports.connect_observers();
         }
         self.observers = observers;
@@ -43,7 +43,7 @@ impl Publications {
         self.publish(ports, simulator, part);
     }
 
-    /// Publishes the current step of worlds. Costs almost nothing without observers.
+    /// Publishes the current step of worlds. This costs almost nothing without observers.
     pub fn publish(&mut self, ports: &Ports, simulator: &Simulator, worlds: Range<usize>) {
         let (n_observers, n_readers) = ports.observers();
         if n_observers == 0 && n_readers == 0 {

@@ -21,10 +21,10 @@ use std::time::{Duration, Instant};
 /// How often an idle server checks for expired leases and new observers.
 const IDLE_TICK: Duration = Duration::from_millis(250);
 
-/// How often a busy server makes these checks. This limits the delay until it notices that a client has died.
+/// How often a busy server checks for expired leases, new observers and dead clients.
 const BUSY_TICK: Duration = Duration::from_millis(50);
 
-/// In one out of this many rounds, the server looks for a control request before a step request.
+/// One round in this many checks for a control request before a step request.
 const CONTROL_FIRST: u64 = 64;
 
 /// How often a server publishes the next batch of worlds for new observers.
@@ -44,11 +44,11 @@ pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -
     Ok(())
 }
 
-/// The event that ended the wait of a round.
+/// The event that ended the wait in one round of the main loop.
 enum Found {
     Step(ActiveStep),
     Control(ActiveControl),
-    /// A wake-up without a request, the end of a process, or a finished reset or file job.
+    /// Any other event: a wake-up without a request, the end of a process, or a finished reset or file job.
     Event,
 }
 
@@ -65,7 +65,7 @@ impl Server {
         let tick = deadline.map_or(tick, |at| {
             tick.min(at.saturating_duration_since(Instant::now()))
         });
-        // Control requests sometimes take precedence, so that a constant stream of steps cannot block them.
+        // In some rounds control requests come first, so that a constant stream of step requests cannot block them.
         self.n_rounds = self.n_rounds.wrapping_add(1);
         if self.n_rounds.is_multiple_of(CONTROL_FIRST)
             && let Some(request) = self.ports.receive_control()
@@ -115,7 +115,7 @@ impl Server {
         let others = exit_with.chain(self.clients.descriptors());
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
         let woken = sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))?;
-        // Wake-ups that stay pending would end the next sleep immediately.
+        // Discards pending wake-ups, because they would end the next sleep immediately.
         self.ports.drain()?;
         Ok(woken)
     }
@@ -141,7 +141,8 @@ impl Server {
         }
     }
 
-    /// Answers waiting requests whose worlds have moved or that have lost a robot. Publishes the worlds that moved.
+    /// Answers waiting requests that can now be answered: their world has moved, or they are refused because their
+    /// lease has lost a robot. Publishes the worlds that moved.
     pub(super) fn answer_settled(&mut self, now: Instant) {
         while let Some((ticket, reply)) = self.simulator.next_answer(&mut self.payload) {
             let mut waiting = self.waiting_steps.iter();
@@ -170,7 +171,7 @@ impl Server {
     }
 
     fn answer_control(&mut self, now: Instant, request: ActiveControl) {
-        // Frees the robots of clients that have just died, so that this request can acquire them.
+        // First frees the robots of clients that have just died, so that this request can acquire them.
         self.forget_ended_clients(now);
         let client = self.clients.identify(request.header().node_id().value());
         let stats = ServerStats {
@@ -205,7 +206,7 @@ impl Server {
         self.answer_settled(now);
     }
 
-    /// Does the work that no request triggers: handles ended clients, finished jobs, expired leases and new observers.
+    /// Does the regular work: handles ended clients, finished jobs, expired leases and new observers.
     fn check_everything(&mut self, now: Instant) -> Result<()> {
         self.last_tick = now;
         self.cancel_abandoned(now);
@@ -240,7 +241,8 @@ impl Server {
         if n_leases > 0 {
             tracing::info!(n_leases, "a connection was closed without a release");
         }
-        // Each of these answers shows the step that it waited for, so it must be sent before the worlds change again.
+        // Each of these answers must show the step for which its request waited, so it is sent before the worlds change
+        // again.
         self.answer_settled(now);
     }
 }

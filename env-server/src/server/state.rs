@@ -27,7 +27,7 @@ use std::hash::BuildHasher;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// How long an ending server waits for its file jobs.
+/// How long a server waits for its file jobs before it ends.
 const LAST_FILES: Duration = Duration::from_secs(10);
 
 pub(super) struct Server {
@@ -41,7 +41,7 @@ pub(super) struct Server {
     pub(super) waiting_steps: Vec<(Ticket, ActiveStep)>,
     pub(super) pending_replies: Vec<(ActiveControl, PendingReply)>,
     pub(super) files: Files,
-    /// Requests that wait for a file, by the number of the file job.
+    /// Control requests that wait for a file, indexed by the number of the file job.
     pub(super) pending_files: HashMap<u64, (ActiveControl, PendingFile)>,
     pub(super) autosave: Option<Autosave>,
     pub(super) payload: Vec<u8>,
@@ -183,7 +183,7 @@ pub fn announce_reach(reach: &Reach) {
     }
 }
 
-/// Creates the worlds. Restores worlds from a snapshot if the settings name one, and returns the resets that start the
+/// Creates the worlds. Restores worlds from a snapshot if the settings name one. Also returns the reset jobs for the
 /// remaining worlds.
 fn simulator(checked: Checked, steps: ThreadPool) -> Result<(Simulator, Vec<ResetJob>)> {
     let settings = checked.clone();

@@ -1,7 +1,7 @@
 //! Instances whose name is in use by another server or still blocked by a dead one.
 //!
-//! Files of a dead process are removed during a turn (`emberwatch_protocol::turn`), for which a process may have to
-//! wait. Until then the dead process appears to own the instance.
+//! Removing the files of a dead process requires a lock (`emberwatch_protocol::turn`), for which a process may have to
+//! wait. Until the files are removed, the dead process appears to own the instance.
 
 use anyhow::Result;
 use emberwatch_protocol::program::WatchedProcess;
@@ -27,7 +27,7 @@ impl Taken {
     fn is_left_over(&self) -> bool {
         match WatchedProcess::open(self.pid) {
             Ok(process) => process.has_ended(),
-            // Any other error does not show whether the process has ended.
+            // Only this error means that the process has ended.
             Err(errno) => errno == Errno::SRCH,
         }
     }
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
     use std::process::Command;
 
-    /// Opens an instance that process `pid` owns at the first attempt, and returns the number of attempts.
+    /// Opens an instance that appears to belong to process `pid` at the first attempt. Returns the number of attempts.
     fn tries(pid: u32) -> usize {
         let mut n_tries = 0;
         let opened = once_free(|| {

@@ -17,17 +17,17 @@ pub const MAX_INTENT_BYTES: usize = 65_536;
 pub struct Intent {
     /// Name of the agent's policy.
     pub policy: String,
-    /// The estimator that made the belief.
+    /// The estimator that computed the belief.
     pub belief_from: String,
     /// The objective of the last path that was flown.
     pub objective: String,
     /// Names of the belief's states.
     pub states: Vec<String>,
-    /// Time that planning the path took, in milliseconds.
+    /// Time taken to plan the path, in milliseconds.
     pub plan_millis: f64,
 }
 
-/// A checked sample of `agent`.
+/// A checked sample of the channel `agent`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AgentBelief {
     /// The header, which contains the world, episode, step and process.

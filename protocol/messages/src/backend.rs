@@ -14,8 +14,8 @@ pub trait Backend {
     /// Returns the server's settings.
     fn info(&self) -> &ServerInfo;
 
-    /// Answers a step request. Fills in the fields that a connection needs: version, sequence number and listener. The
-    /// answer to a `Step` waits until the worlds have moved.
+    /// Answers a step request. Fills in the request's version, sequence number and listener, if the backend is a
+    /// connection. A `Step` is answered only after the worlds have moved.
     ///
     /// # Errors
     /// If the server refuses, has ended, or sends no valid answer in time.

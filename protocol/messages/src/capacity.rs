@@ -1,6 +1,6 @@
 //! Maximum numbers of clients, worlds, robots and cells, also listed in PROTOCOL.md.
 
-/// Maximum number of clients at a time on each of `step` and `control`.
+/// Maximum number of clients that can be connected to a channel (`step` or `control`) at a time.
 pub const MAX_CLIENTS: usize = 16;
 
 /// Maximum number of worlds of a server.
@@ -12,5 +12,5 @@ pub const MAX_ROBOTS: usize = 64;
 /// Maximum number of robots of a server, over all its worlds.
 pub const MAX_ROBOT_NUMBERS: usize = 4096;
 
-/// Maximum number of cells in all frames of one world together.
+/// Maximum total number of cells in the frames of one world's robots.
 pub const MAX_TEAM_CELLS: usize = 1 << 24;

@@ -27,8 +27,9 @@ pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(600);
 /// A lease on consecutive robots of a server, or of worlds in this process. Robots are numbered across all worlds:
 /// robot r of world w is `w * R + r`.
 ///
-/// Dropping the client drops its backend, and dropping a connection ends its leases. Unless it documents other errors,
-/// a method fails if the server refuses the request (and changes nothing), has ended, or sends no valid answer in time.
+/// Dropping the client drops its backend, and dropping a connection ends its leases. Unless a method documents other
+/// errors, it fails if the server has ended, refuses the request, or sends no valid answer in time. A refused request
+/// changes nothing.
 pub struct Client<B> {
     backend: B,
     lease: Lease,
@@ -98,7 +99,7 @@ impl<B: Backend> Client<B> {
         self.backend.info()
     }
 
-    /// Returns the connection or the worlds, for requests that have no method here.
+    /// Returns the backend (a connection, or worlds in this process), for requests that have no method here.
     pub fn backend(&mut self) -> &mut B {
         &mut self.backend
     }
@@ -139,7 +140,7 @@ impl<B: Backend> Client<B> {
     }
 
     /// Flies as [`Self::step`] does, but returns `None` if `is_over` returns true before the worlds have moved.
-    /// `is_over` is called every [`STEP_TIMEOUT`] plus the server's deadline.
+    /// `is_over` is called periodically, at intervals of [`STEP_TIMEOUT`] plus the server's deadline.
     ///
     /// # Errors
     /// The same as [`Self::step`].

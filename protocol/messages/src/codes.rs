@@ -6,8 +6,8 @@ use thiserror::Error;
 /// Version of the protocol.
 pub const VERSION: u32 = 2;
 
-/// Flag in [`crate::message::StepRequest::flags`]: observe every cell, not only the path. The server's coverage must be
-/// `client` or `full`.
+/// Flag in [`crate::message::StepRequest::flags`]: observe every cell, not only the path. Allowed only if the server's
+/// coverage is `client` or `full`.
 pub const FLAG_FULL_COVERAGE: u32 = 1;
 
 /// Flag in [`crate::message::StepRequest::flags`]: return one frame per world, with everything that its robots saw,
@@ -60,8 +60,8 @@ pub enum Status {
     BadMove = 7,
     /// The lease does not cover these robots, or was never granted; detail: the first such robot.
     NoLease = 8,
-    /// The lease was taken over, expired or released; detail: pid of the client that took over the robot or holds it, 0
-    /// if there is none.
+    /// The lease was taken over, expired or released; detail: pid of the client that took over the robot or holds it
+    /// now, or 0 if there is no such client.
     LeaseLost = 9,
     /// Another client holds a robot; detail: its pid.
     Busy = 10,
@@ -76,18 +76,21 @@ pub enum Status {
     UnknownFlags = 14,
     /// The file cannot be read or written, or its contents are rejected; detail: 0.
     BadFile = 17,
-    /// The server no longer has the frame or belief; detail: the nearest step that it has, or the current step.
+    /// The server does not keep the frame or belief; detail: for a frame, the nearest step that is kept, and for a
+    /// belief, the current step.
     NotKept = 18,
-    /// The world is past the step k of a path; detail: its current step. `Observe` shows whether the path was flown.
+    /// A path is for a step k that its world has already passed; detail: the world's current step. `Observe` shows
+    /// whether the path was flown.
     Late = 19,
-    /// The step k of a path is ahead of its world; detail: the world's current step.
+    /// A path is for a step k that its world has not reached yet; detail: the world's current step.
     Early = 20,
-    /// A step request leaves out a robot that its client holds in the world, or covers several worlds although another
+    /// A step request omits a robot that the client holds in the same world, or covers several worlds although another
     /// client holds a robot in one of them; detail: the first such robot.
     Incomplete = 21,
     /// The server has no such robot; detail: number of robots of all worlds.
     NoSuchRobot = 22,
-    /// There is too little memory for the answer; detail: size of the step's answer in bytes, or 0 for shared memory.
+    /// There is too little memory for the answer; detail: size of the step's answer in bytes, or 0 if shared memory is
+    /// short.
     NoMemory = 23,
 }
 

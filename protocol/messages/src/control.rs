@@ -44,8 +44,8 @@ pub enum Request {
         /// The lease.
         lease: u64,
     },
-    /// Start new episodes; the answer is sent when the burn-in is done. As with `Restore` and `Fork`, the client needs
-    /// a lease on at least one robot of these worlds, and no other client may hold one.
+    /// Start new episodes; the answer is sent when the burn-in is done. The client needs a lease on at least one robot
+    /// of these worlds, and no other client may hold any of their robots. The same applies to `Restore` and `Fork`.
     Reset {
         /// The lease.
         lease: u64,
@@ -95,7 +95,7 @@ pub enum Request {
         offset: u64,
     },
     /// Ask for the state of the server and its worlds.
-    // The variant has braces because serde rejects unknown keys in it, but not in a unit variant.
+    // The braces make serde reject unknown keys, which it would accept in a unit variant.
     Status {},
     /// Stop the server.
     Shutdown {},
@@ -133,7 +133,7 @@ pub enum Reply {
         path: String,
         /// The length of the file in bytes.
         n_bytes: u64,
-        /// The worlds in the file, as they were written.
+        /// The worlds in the file, with their steps at the time of writing.
         worlds: Vec<WorldInfo>,
     },
     /// Answers `restore` and `fork`: the worlds after the replacement.

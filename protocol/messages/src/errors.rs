@@ -92,7 +92,7 @@ pub enum ChannelError {
     NoDescriptors {
         /// The attempted operation.
         what: &'static str,
-        /// Number of file descriptors that it needs.
+        /// Number of file descriptors that the operation needs.
         needed: usize,
         /// Maximum number of file descriptors of the process.
         limit: String,
@@ -137,7 +137,7 @@ pub enum ConnectionError {
         /// Name of the instance.
         instance: String,
     },
-    /// No answer came in time. The step may have been made nevertheless: observe before the next one.
+    /// No answer came in time. The step may still have been taken, so observe the worlds before the next step.
     #[error("no answer to {what} from instance {instance:?} within {timeout:.1?}")]
     Timeout {
         /// Kind of the request.
@@ -182,7 +182,7 @@ pub fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // The message names a flag of the agent, the usual caller. Other callers may not have this flag.
+                // The message names a flag of the agent, the usual caller. Other callers might lack this flag.
                 Status::Busy => format!(
                     "busy: held by pid {detail}; wait for its release, or take over with the flag \
                      --takeover of `emberwatch-agent run`"
@@ -216,7 +216,7 @@ pub fn check_answer(
     Err(garbled(what, problem))
 }
 
-/// Returns the error for a refusal that the server would send.
+/// Returns the error of a request that is refused with this status and detail.
 pub fn refused(status: Status, detail: u64) -> ConnectionError {
     ConnectionError::Refused {
         status,

@@ -14,7 +14,8 @@ pub struct ServerInfo {
     pub build: String,
     /// The server's process id.
     pub pid: u32,
-    /// The number of the PID namespace of `pid` on Linux. Only in this namespace can a client watch the process.
+    /// The number of the PID namespace to which `pid` belongs, on Linux. A client can watch the process only from
+    /// within this namespace.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pid_namespace: Option<u64>,
     /// Grid height H.
@@ -37,10 +38,11 @@ pub struct ServerInfo {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
     /// Identifies the worlds: 16 hexadecimal digits of a hash over every setting that affects rewards, except the seed
-    /// and the policy. Servers before release 0.3 do not have it.
+    /// and the policy. Servers before release 0.3 do not send it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub worlds_fingerprint: Option<String>,
-    /// Where robots may fly and what they see. Without it, they may fly everywhere and see the cells of their path.
+    /// Where robots may fly and what they see. If absent, robots may fly everywhere and see only the cells of their
+    /// path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub airspace: Option<AirspaceInfo>,
     /// The zone of each cell, if there are several zones. It is for display only, and learners do not read it.
@@ -61,7 +63,8 @@ pub struct ServerInfo {
     pub publish_truth: bool,
     /// Default time from the last use of a lease until it ends.
     pub lease_millis: u64,
-    /// Time that a world waits for the paths of its other held robots after the first path; 0 for no deadline.
+    /// Time that a world waits, after it has received the first path, for the paths of its other held robots; 0 for no
+    /// deadline.
     pub deadline_millis: u64,
 }
 
@@ -128,7 +131,7 @@ pub enum CoverageRule {
 pub struct AirspaceInfo {
     /// Number of rows and columns that robots see beyond each cell of their path, 0 to 8.
     pub radius: usize,
-    /// Number of observation matrices: one for the path, and one per ring around it. The last one applies to all
+    /// Number of observation matrices: one for the path, and one per ring around it. The last matrix applies to all
     /// further rings. Observation y of matrix m has the index `m * n_observations / n_rings + y`.
     pub n_rings: usize,
     /// Whether visited or seen cells earn rewards.

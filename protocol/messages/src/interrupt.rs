@@ -6,8 +6,8 @@ use std::sync::OnceLock;
 static CHECK: OnceLock<fn() -> bool> = OnceLock::new();
 
 /// Sets the check for interrupts in this process. When `check` returns true, a wait ends with
-/// [`ChannelError::Interrupted`]. A waiting thread calls it every 50 ms and when a signal arrives. The check can be set
-/// only once; later calls have no effect.
+/// [`ChannelError::Interrupted`]. A waiting thread calls `check` every 50 ms and when a signal arrives. The check can
+/// be set only once; later calls have no effect.
 pub fn interrupt_when(check: fn() -> bool) {
     CHECK.get_or_init(|| check);
 }

@@ -31,7 +31,7 @@ pub fn parse<T: DeserializeOwned>(text: &[u8]) -> Result<T, String> {
 mod tests {
     use super::*;
 
-    /// A request of one operation.
+    /// A request type with a single operation.
     #[derive(Debug, serde::Deserialize)]
     #[serde(tag = "op")]
     enum Request {

@@ -22,7 +22,7 @@ pub struct Lease {
     deadline: Duration,
     worlds: Range<u32>,
     known: Vec<Known>,
-    /// Number of times that paths were sent. It orders the calls.
+    /// Number of times that paths were sent. It serves as the sequence number of a call.
     n_sent: AtomicU64,
 }
 
@@ -31,28 +31,29 @@ pub struct Lease {
 struct Known {
     /// The last step observed.
     step: AtomicU64,
-    /// The `n_sent` of the last paths for the world that were not refused. Only these can have moved the world.
+    /// The `n_sent` of the last paths for the world that were not refused. Only paths that were not refused can have
+    /// moved the world.
     sent: AtomicU64,
 }
 
-/// A step request of a lease. If it is sent again, its paths are for the same steps.
+/// A step request of a lease. When a call is sent again, its paths are still for the same steps.
 #[derive(Debug)]
 pub struct Call<'a> {
     request: StepRequest,
     /// The moves of all paths.
     moves: &'a [u8],
-    /// The step of each world that the paths are for; empty until they are first sent.
+    /// For each world, the step that its paths are for; empty until the call is first sent.
     steps: Vec<u64>,
     timeout: Duration,
     /// The `n_sent` at which these paths were last sent. For an observation, the `n_sent` of the paths whose effect
     /// should be observed.
     sent: u64,
-    /// Whether the observation may instead show the effect of other paths of the lease.
+    /// Whether the observation may show the effect of other paths of the lease instead of these paths.
     shows_others: bool,
 }
 
 impl<'a> Call<'a> {
-    /// Makes a call from a request of [`Lease::request`] and the moves of all paths.
+    /// Makes a call from a request that [`Lease::request`] returned, and the moves of all paths.
     pub fn new(request: StepRequest, moves: &'a [u8], timeout: Duration) -> Self {
         Self {
             request,
@@ -92,7 +93,7 @@ impl Lease {
         }
     }
 
-    /// Returns the server's number of the lease.
+    /// Returns the number that the server gave to the lease.
     pub fn number(&self) -> u64 {
         self.number
     }
@@ -160,7 +161,7 @@ impl Lease {
         if flies && !matches!(answer, Err(ConnectionError::Refused { .. })) {
             self.note_sent(worlds.clone(), call);
         } else {
-            // An observation may include robots outside the lease.
+            // Worlds outside the lease, which an observation may include, are not tracked.
             let known = worlds.clone().filter_map(|world| self.known(world));
             let mut sent = known.map(|known| known.sent.load(Ordering::Relaxed));
             call.shows_others = sent.any(|sent| sent != call.sent);
@@ -174,13 +175,13 @@ impl Lease {
         Ok(answer)
     }
 
-    /// Sends paths until their worlds have moved. After each timeout it observes the worlds, and sends the paths again
-    /// if they have not moved. So it waits for a slow teammate, but not for a silent server. Returns the answer, and
-    /// the number of earlier steps that the client did not see. Returns `None` if `gives_up` returns true after an
-    /// observation.
+    /// Sends paths and waits until their worlds have moved. After each timeout, observes the worlds, and resends the
+    /// paths if the worlds have not moved. Thus a slow teammate only delays the step, but a silent server makes it
+    /// fail. Returns the answer, and the number of steps before it that the client did not see. Returns `None` if
+    /// `gives_up` returns true after an observation.
     ///
-    /// `send` calls [`Self::send`] with the backend. If `accepts_late` is set, the answer shows the current worlds even
-    /// if they moved without these paths.
+    /// `send` must call [`Self::send`] with the backend. If `accepts_late` is set, the answer shows the current worlds
+    /// even if they moved without these paths.
     ///
     /// # Errors
     /// The errors of `send` and `gives_up`, and a `Late` refusal if worlds moved without the paths.
@@ -192,7 +193,8 @@ impl Lease {
         mut gives_up: impl FnMut() -> Result<bool, ConnectionError>,
     ) -> Result<Option<(StepAnswer, u64)>, ConnectionError> {
         let mut look = self.look(&paths);
-        // A shorter timeout would withdraw the path that started the deadline.
+        // A request that times out before the server's deadline withdraws its path, which may be the path that started
+        // the deadline.
         paths.timeout = paths.timeout.saturating_add(self.deadline);
         loop {
             match send(&mut paths) {
@@ -219,8 +221,8 @@ impl Lease {
         }
     }
 
-    /// Records that paths were sent and not refused. Skips worlds that are known to have moved before, because there
-    /// the refusal may have been lost.
+    /// Records that paths were sent and not refused. Skips worlds that are known to have moved already: there the paths
+    /// may have been refused, and the refusal lost.
     fn note_sent(&self, worlds: Range<u32>, paths: &Call<'_>) {
         for (world, step) in worlds.zip(&paths.steps) {
             let known = self.known(world);
@@ -263,7 +265,7 @@ impl Lease {
     }
 
     fn steps_of(&self, worlds: Range<u32>) -> impl Iterator<Item = u64> {
-        // For a robot outside the lease, any step is good enough, because the server refuses the request.
+        // For a world outside the lease, any step will do, because the server refuses the request.
         let step = |known: &Known| known.step.load(Ordering::Relaxed);
         worlds.map(move |world| self.known(world).map_or(0, step))
     }

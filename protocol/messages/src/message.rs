@@ -13,7 +13,7 @@ pub use super::codes::{
 
 /// A header of plain bytes, which can be stored in shared memory.
 pub trait Header: std::fmt::Debug + Default + Pod + Send + Sync {
-    /// The name that distinguishes the types of channels.
+    /// The type name by which iceoryx2 checks that both ends of a channel use the same header.
     const TYPE_NAME: &'static str;
 }
 
@@ -39,7 +39,7 @@ headers!(
 );
 
 /// Header of a `step` request. The payload of `Step` is the current step k of each world (`u64`), then a path of
-/// `n_moves` bytes for each robot. The payload of `Recall` is the step of each world; `Observe` has none.
+/// `n_moves` bytes for each robot. The payload of `Recall` is the step of each world; `Observe` has no payload.
 ///
 /// Robots are numbered across all worlds of a server: robot r of world w has the number `w * R + r`.
 #[repr(C)]
@@ -63,13 +63,13 @@ pub struct StepRequest {
     pub flags: u32,
     /// Low half of the id of the client's listener on `wake-client`. If both halves are 0, the server sends no wake-up.
     pub listener_low: u64,
-    /// High half of that id.
+    /// High half of the listener's id.
     pub listener_high: u64,
 }
 
 /// Header of a `step` answer. The payload is `n_worlds` [`WorldResult`]s, `n_robots` [`RobotResult`]s, then frames of
-/// `height * width` bytes: one for each robot, or with [`FLAG_TEAM_FRAMES`] one for each world. It is empty unless the
-/// status is `Ok`.
+/// `height * width` bytes: one for each robot, or with [`FLAG_TEAM_FRAMES`] one for each world. The payload is empty
+/// unless the status is `Ok`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct StepReply {
@@ -91,8 +91,8 @@ pub struct StepReply {
     pub height: u32,
     /// Grid width W.
     pub width: u32,
-    /// Time that the server spent on the request in nanoseconds, for checks, simulation and copying. The wait for other
-    /// clients' paths does not count.
+    /// Time in nanoseconds that the server spent on checks, simulation and copying for this request. The wait for other
+    /// clients' paths is not included.
     pub simulation_nanos: u64,
     /// The detail of the status; see [`Status`].
     pub detail: u64,
@@ -108,11 +108,12 @@ pub struct WorldResult {
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of the rewards in `X_{k+1}` of the distinct cells that any robot visited.
+    /// Sum of the rewards of the distinct cells that any robot visited, each in its state in `X_{k+1}`.
     pub reward: f64,
-    /// Bit r is set if no client held robot r of the world. Such a robot stays in its cell and sees nothing.
+    /// Bit r is set if no client held robot r of the world. A robot that nobody holds stays in its cell and sees
+    /// nothing.
     pub hovered: u64,
-    /// Bit r is set if robot r was held, but its path was not received by the deadline. Such a robot stays in its cell
+    /// Bit r is set if robot r was held, but its path was not received by the deadline. A late robot stays in its cell
     /// and sees nothing.
     pub late: u64,
     /// Number of cells of the whole grid in the state with the highest reward (burning cells).
@@ -133,11 +134,11 @@ pub struct WorldResult {
 pub struct RobotResult {
     /// The robot's share of the team's reward: a cell that v robots visited pays 1/v of its reward to each.
     pub reward: f64,
-    /// The difference that the robot made: the team's reward minus the reward without this robot.
+    /// The robot's marginal contribution: the team's reward minus the team's reward without this robot.
     pub marginal: f64,
     /// Number of distinct cells that the robot visited.
     pub n_visited: u32,
-    /// Number of these cells in the state with the highest reward.
+    /// Number of distinct visited cells in the state with the highest reward.
     pub n_hits: u32,
     /// Row where the path began, or where the robot stays.
     pub start_row: u32,
@@ -183,7 +184,7 @@ pub struct ControlRequest {
     pub sequence: u64,
     /// Low half of the id of the client's listener on `wake-client`. If both halves are 0, the server sends no wake-up.
     pub listener_low: u64,
-    /// High half of that id.
+    /// High half of the listener's id.
     pub listener_high: u64,
 }
 

@@ -41,7 +41,7 @@ pub struct RobotSample<'a> {
 
 impl StepParts<'_> {
     /// Checks that only existing robots are marked as having stayed, that paths are complete, and that frames contain
-    /// observations.
+    /// only valid observations.
     ///
     /// # Errors
     /// Describes the first wrong value.
@@ -157,7 +157,8 @@ pub fn split_frame_payload<'a>(
         .collect()
 }
 
-/// Appends the payload of a `Step` request, steps and paths. Without paths, this is the payload of a `Recall`.
+/// Appends the payload of a `Step` request: the steps, then the paths. Without paths, this is the payload of a
+/// `Recall`.
 pub fn write_step_body(steps: &[u64], paths: &[u8], body: &mut Vec<u8>) {
     body.extend_from_slice(bytemuck::cast_slice(steps));
     body.extend_from_slice(paths);

@@ -17,7 +17,7 @@ enum Say {
     Nothing,
     Late,
     Step(u64),
-    /// A step, and masks of the robots that hovered and that were late.
+    /// A world's step, a bit mask of the robots that hovered, and a bit mask of the late robots.
     Stayed(u64, u64, u64),
 }
 use Say::{Late, Nothing, Stayed, Step};
@@ -133,7 +133,7 @@ fn paths_are_sent_until_the_world_has_moved() {
     assert_eq!(asked, [sent, look, sent], "for the same step");
     check(&[Nothing, Step(5)], false, Ok(Some((5, 0))));
     check(&[Nothing, Stayed(5, 0b01, 0)], false, Ok(Some((5, 0))));
-    // The flight can be given up.
+    // `gives_up` can end the flight.
     check(&[Nothing, Step(4), Nothing, Step(4)], false, Ok(None));
 }
 
@@ -149,7 +149,7 @@ fn paths_that_did_not_move_the_world_are_late() {
     check(&[Nothing, Stayed(5, 0, 0b10)], true, Ok(Some((5, 0))));
 }
 
-/// Flies while another thread sends a request, after the flying thread has sent `after` requests.
+/// Flies, and lets another thread send one request as soon as the flying thread has sent `after` requests.
 fn fly_beside(other: Operation, after: usize, says: &[Say]) -> Result<(), Status> {
     let (lease, mut script) = lease(says);
     let mut others = call(&lease, other);

@@ -61,7 +61,7 @@ fn record(nanos: u64, n_lost: u32, event: Event) -> Record {
     }
 }
 
-/// Returns records of a server, hidden states and frames, and of a second server with another grid.
+/// Returns example records: a server with its hidden states and frames, and a second server with another grid.
 fn example() -> Vec<Record> {
     let flown =
         |sequence, grid, n_moves, bytes: &[u8]| Event::Frame(frame(sequence, grid, n_moves, bytes));
@@ -107,7 +107,7 @@ fn read(bytes: &[u8]) -> (Vec<Record>, Option<RecordingError>) {
     }
 }
 
-/// Counts the frames of steps. No step occurs twice in the example.
+/// Counts the records of steps, which are frames with k > 0. The example contains no step twice.
 fn count_steps(records: &[Record]) -> u64 {
     let is_step = |record: &&Record| matches!(&record.event, Event::Frame(sample) if sample.header.result.step > 0);
     records.iter().filter(is_step).count() as u64
@@ -245,7 +245,7 @@ fn a_hostile_record_is_refused_by_where_it_is() {
     }
 }
 
-/// Rows of changes to a sample, and part of the error for each.
+/// Builds a table whose rows are a change to a sample, and a part of the error that it must cause.
 macro_rules! changes {
     ($of:ty, $sample:ident: $($change:block $words:literal)*) => {{
         let changes: &[(fn(&mut Sample<$of>), &str)] = &[$((|$sample| $change, $words)),*];

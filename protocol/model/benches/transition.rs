@@ -1,4 +1,4 @@
-//! One transition of a world, and one prediction of a belief, on one core.
+//! Measures one transition of a world and one prediction of a belief, on one core.
 //!
 //! For comparison: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
 //!
@@ -7,15 +7,15 @@
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use emberwatch_model::{Dynamics, Model, Probabilities, Shape, Transition};
 
-/// Steps before measuring: enough for all three states to form clusters, as in a world in use.
+/// Number of steps before the measurement, after which all three states form clusters, as in a typical world.
 const BURN_IN: u64 = 2_000;
 
 fn square(side: usize) -> Shape {
     Shape::new(side, side).expect("bench shape")
 }
 
-/// Returns the default model and a model with own-state kernels. For 64 x 64 cells, also returns the second model with
-/// 35 zones.
+/// Returns the default model and a model with own-state kernels. For 64 x 64 cells, also returns an own-state model
+/// with 35 zones.
 fn models(side: usize) -> impl Iterator<Item = (Model, &'static str)> {
     let named = |name| Model::built_in(name).expect("bench model");
     let all = [

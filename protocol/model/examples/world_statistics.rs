@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release -p emberwatch-model --example world_statistics -- --runs 32`
 //!
-//! Exits with 1 if any statistic differs by more than 3 combined standard errors. The reference has only 7 runs, and
-//! the statistics are correlated. With other seeds, one just above 3 does not prove an error.
+//! Exits with 1 if any statistic differs by more than 3 combined standard errors. With other seeds, a difference just
+//! above 3 does not prove an error: the reference has only 7 runs, and the statistics are correlated.
 
 #![expect(clippy::print_stdout, reason = "the table is the output")]
 

@@ -21,7 +21,8 @@ pub struct Airspace {
 pub struct SeenCell {
     /// The row-major index of the cell.
     pub cell: usize,
-    /// The index of its observation matrix: the smallest ring in which any cell of the path sees it.
+    /// The index of its observation matrix: the cell's ring around the nearest cell of the path, but at most the last
+    /// ring with a matrix.
     pub ring: u8,
 }
 

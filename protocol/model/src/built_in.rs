@@ -1,5 +1,5 @@
-//! The models, tasks and recorded states that ship with the programs. They are the files of `config/models` and
-//! `config/tasks` and the folders of `config/landscapes`, each under its name. `build.rs` lists them.
+//! The models, tasks and recorded states that ship with the programs. Each is named after its file in `config/models`
+//! or `config/tasks`, or its folder in `config/landscapes`. `build.rs` lists them.
 
 /// Built-in models, as `(name, text of the file)`.
 pub(crate) static MODELS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/models.rs"));

@@ -10,8 +10,8 @@ use ndarray::{Array1, Array2, Array4, ArrayViewMut1, s};
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
 
-/// Allowed magnitudes of weights, biases and rewards that are not zero. Their sums and products neither overflow nor
-/// vanish in `f64`.
+/// Allowed magnitudes of weights, biases and rewards that are not zero. Within this range, sums and products neither
+/// overflow nor vanish in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
 /// Maximum number of weights in all kernels together, 512 MiB. A model with 64 own-state kernels of 15 x 15 cells has
@@ -232,7 +232,8 @@ impl Checker<'_> {
             .or_else(|(expected, got)| self.wrong(what.into(), &expected, got))
     }
 
-    /// Returns the kernels, zone by zone. Each zone has one kernel, or one per own state of the cell.
+    /// Returns the kernels, zone by zone. Each zone has one kernel, or one for each own state (the state of the cell
+    /// itself).
     pub fn kernels(&self, file: &ModelFile) -> Result<Vec<Array4<f64>>, ModelError> {
         let [height, width] = file.kernel_size;
         let odd = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
@@ -265,8 +266,8 @@ impl Checker<'_> {
             if !filled.insert((zone, own, to, from)) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
-            // The centre of the kernel is the cell itself, in its own state. Weights of other states have no effect
-            // there.
+            // The neighbour at the centre of the kernel is the cell itself, whose state is `own`. So the centre weights
+            // of other states have no effect.
             let is_void =
                 |tap| entry.own.is_some() && own != from && tap == (height / 2, width / 2);
             for (row, col, weight) in self.weights(entry, file.kernel_size)? {

@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
-    /// Name shown to people.
+    /// Name for display.
     pub name: String,
-    /// Duration of one step, for people.
+    /// Duration of one step, as text for display.
     pub step: String,
     /// No-fly map with 1 for each cell closed to robots, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -41,7 +41,7 @@ pub struct DescribedState {
 }
 
 impl Description {
-    /// Builds a model with these states, observations and rewards. In it, no cell ever changes its state.
+    /// Builds a model with these states, observations and rewards. In this model, no cell ever changes its state.
     ///
     /// # Errors
     /// If an entry is wrong. The error names the entry, the expected value and the given value.

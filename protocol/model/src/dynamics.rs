@@ -45,13 +45,13 @@ use std::sync::Arc;
 const BAND: usize = 8192;
 
 /// The transition of a world for one model on one grid, with its buffers. Results do not depend on the buffers'
-/// content. Each thread needs a clone.
+/// content. Each thread needs its own clone.
 #[derive(Debug, Clone)]
 pub struct Dynamics {
     shape: Shape,
     tables: Arc<Tables>,
     places: Places,
-    /// Homes (see `places.rs`) of the undecided cells of a band.
+    /// The undecided cells of a band, each as the index of its home (see `places.rs`).
     undecided: Vec<u32>,
     /// Random numbers for the undecided cells.
     randoms: Vec<u8>,
@@ -62,16 +62,16 @@ pub struct Dynamics {
 struct Tables {
     n_states: usize,
     initial: Vec<f64>,
-    /// The kernels, zone by zone. Each zone has one kernel, or one per own state of the cell.
+    /// The kernels, zone by zone. Each zone has one kernel, or one for each own state (the state of the cell itself).
     kernels: Vec<Kernel>,
     /// Number of kernels per zone.
     n_own: usize,
-    /// The zone of each home, if the model has several zones.
+    /// The zone of each cell, indexed by home (see `places.rs`), if the model has several zones.
     zones: Option<Vec<u8>>,
-    /// The place that each tap reads, relative to a cell's home.
+    /// For each tap, the offset of the neighbour from the cell's home (see `places.rs`).
     offsets: Vec<usize>,
     bytes: Bytes,
-    /// `None` if the model has too many weights for tables. Then the kernels of every cell are summed.
+    /// `None` if the model has too many weights for tables. Then every cell needs the full sum of eq. 2.
     parents: Option<Parents>,
 }
 
@@ -166,8 +166,8 @@ impl Tables {
         let mixtures = Mixture::of_kernels(&kernels, model.n_zones(), model.sees_own_state());
         let (offsets, zones) = (places.offsets(model), places.zones(model));
         let parents = Parents::new(&mixtures, &offsets, zones.as_deref());
-        // Without `parents`, bytes must not decide any cell: the full sum gives the whole distribution, not the
-        // residual one.
+        // Without `parents`, bytes must not decide any cell, because the full sum draws from the whole distribution
+        // instead of the residual one.
         let by_bytes = if parents.is_some() {
             &mixtures[..]
         } else {
@@ -185,7 +185,8 @@ impl Tables {
         }
     }
 
-    /// Computes eq. 2: the weight of each next state of a cell. `states` begins at the cell's home.
+    /// Computes eq. 2: the weight of each next state of a cell. `states` is the part of the buffer that begins at the
+    /// cell's home.
     fn weights(&self, home: usize, states: &[u8]) -> [f64; MAX_VALUES] {
         let zone = self.zones.as_ref().map_or(0, |zones| zones[home]);
         let of_zone = &self.kernels[usize::from(zone) * self.n_own..][..self.n_own];

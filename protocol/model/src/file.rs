@@ -13,8 +13,8 @@ pub const MAX_VALUES: usize = 64;
 /// Maximum side of a kernel: 15 cells.
 pub const MAX_KERNEL_SIDE: usize = 15;
 
-/// Minimum sum of a cell's weights, as a share of the largest weight. The smallest normal `f32` is 1e-38, so larger
-/// sums keep their precision.
+/// Minimum sum of a cell's weights, relative to the largest weight. The smallest normal `f32` is 1e-38, so larger sums
+/// keep their precision.
 pub(super) const LEAST_SHARE: f64 = 1e-30;
 
 /// Maximum number of zones: the number of values of a byte.
@@ -27,7 +27,7 @@ pub const MAX_RADIUS: usize = 8;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelFile {
-    /// Name shown to people.
+    /// Name for display.
     pub name: String,
     /// Number of rows and columns of the transition kernel, both odd.
     pub kernel_size: [usize; 2],
@@ -88,13 +88,13 @@ pub struct ObservationEntry {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SensorEntry {
-    /// Number of rows and columns that the sensor sees around each cell of the path (a Chebyshev distance).
+    /// Number of rows and columns that the sensor sees beyond each cell of the path (a Chebyshev distance).
     #[serde(default)]
     pub radius: usize,
     /// The cells that earn a reward.
     #[serde(default)]
     pub pays: Pays,
-    /// The observation matrices of rings 1, 2 and so on. The last one applies to all further rings. Without rings,
+    /// The observation matrices of rings 1, 2 and so on. The last matrix applies to all further rings. Without rings,
     /// `observed_as` of the states applies everywhere.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub rings: Vec<RingEntry>,
@@ -237,7 +237,7 @@ pub enum ModelError {
         shape: Shape,
         /// The first such cell.
         cell: Cell,
-        /// The smallest sum of its weights, as a share of the largest weight.
+        /// The smallest sum of the cell's weights, relative to the largest weight.
         share: f64,
     },
 }

@@ -13,7 +13,7 @@ use ndarray::{Array1, Array2, Array4, Axis};
 use std::path::Path;
 use std::sync::Arc;
 
-/// A checked model. Every value of this type can be simulated and filtered.
+/// A checked model. Every value of this type is valid for simulation and filtering.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     file: ModelFile,
@@ -177,7 +177,7 @@ impl Model {
         Ok(())
     }
 
-    /// Checks the smallest possible sum of a cell's weights, as a share of the largest weight.
+    /// Checks the smallest possible sum of a cell's weights, relative to the largest weight.
     fn check_share(&self, share: f64, shape: Shape, cell: Cell) -> Result<(), ModelError> {
         let model = || self.name().into();
         if share <= 0.0 {
@@ -217,8 +217,8 @@ impl Model {
 
     /// Returns the number of the sensor's observation matrices: one for the path, and one per ring around it.
     ///
-    /// The last one applies to all further rings up to the radius. Observation `y` of matrix `m` has the index `m * O /
-    /// n_rings + y`.
+    /// The last matrix applies to all further rings up to the radius. Observation `y` of matrix `m` has the index `m *
+    /// O / n_rings + y`.
     pub fn n_rings(&self) -> usize {
         1 + self
             .file
@@ -243,7 +243,7 @@ impl Model {
         self.n_own() > 1
     }
 
-    /// Returns the number of kernels per zone: 1, or one per own state.
+    /// Returns the number of kernels per zone: 1, or the number of own states.
     fn n_own(&self) -> usize {
         self.kernels.len() / self.n_zones()
     }
@@ -276,7 +276,8 @@ impl Model {
 
     /// Returns the kernels `w[to, from, row, col]`, each of shape `[S, S, KH, KW]`. All weights are `>= 0` (eq. 2).
     ///
-    /// Each zone has one kernel, or one per own state of the cell. The kernels of a zone are stored contiguously.
+    /// Each zone has one kernel, or one for each own state (the state of the cell itself). The kernels of a zone are
+    /// stored contiguously.
     pub fn kernels(&self) -> &[Array4<f64>] {
         &self.kernels
     }

@@ -7,7 +7,7 @@ use thiserror::Error;
 /// Maximum number of moves in a path: 4096.
 pub const MAX_MOVES: usize = 4096;
 
-/// One step of the robot to a neighbouring cell; the paper's set `V`.
+/// A move of the robot to a neighbouring cell, an element of the paper's set `V`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[repr(u8)]
 pub enum Move {

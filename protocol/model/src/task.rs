@@ -27,10 +27,10 @@ pub struct Task {
     /// A built-in model or a model file. Empty if the states were recorded.
     #[serde(default)]
     pub model: String,
-    /// Recorded states, built in or a file. Empty if a model simulates the worlds.
+    /// Built-in recorded states, or a file of recorded states. Empty if a model simulates the worlds.
     #[serde(default)]
     pub states: String,
-    /// Whether the seed also selects a symmetry of the grid.
+    /// Whether the seed also selects a symmetry of the grid (a rotation or reflection).
     #[serde(default)]
     pub states_symmetries: bool,
     /// The maximum recorded step at which an episode begins; the seed draws one from 0 to this.
@@ -66,7 +66,7 @@ pub struct Task {
     pub listing: Option<Listing>,
 }
 
-/// The entry of a built-in task in lists.
+/// A built-in task's entry in lists of tasks.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Listing {
@@ -199,7 +199,7 @@ impl Task {
         Ok(task)
     }
 
-    /// Checks what the server cannot check, because it replaces a missing setting with its default.
+    /// Checks the settings that the server cannot check, because it replaces missing settings with defaults.
     fn check(&self) -> Result<(), String> {
         let needs = |setting: &str, expected: &str, got: &dyn std::fmt::Display| {
             Err(format!("{setting}: expected {expected}, got {got}"))
@@ -284,7 +284,7 @@ mod tests {
         assert!(places.is_sorted_by(|a, b| a < b), "{places:?}");
     }
 
-    /// Built-in task => part of its file => replacement => part of the error.
+    /// Each row: a built-in task => a part of its file => the replacement => a part of the resulting error.
     const WRONG: &str = r#"
 small => height => heigth => unknown field `heigth`
 small => moves = 16 =>  => missing field `moves`

@@ -6,18 +6,18 @@
 //! same operator.
 //!
 //! If the kernels depend on the cell's own state `o`, `phi[m | o]` has the weights of `o`, and the cell at the centre
-//! of the kernel is in state `o`. Then `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean field: it
-//! assumes that the cell and its neighbours are independent, as the filter does.
+//! of the kernel is in state `o`. Then `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean-field
+//! approximation: it assumes that the cell and its neighbours are independent, as the filter does.
 //!
 //! If the model has zones, each cell has the weights of its zone.
 //!
 //! `tests/model/models.rs` computes these sums directly, and `tests/model/transition.rs` compares the results for
 //! random models and grids.
 //!
-//! Two optimisations leave the results unchanged. The belief is copied into planes with a margin, so that the same
-//! operations compute every cell, and many cells at once. In addition, the beliefs at taps with equal weights are added
-//! before they are multiplied (`rows.rs`). Every lane performs the same operations in the same order, and no operation
-//! is fused, so results are bit-identical on every platform.
+//! Two optimisations leave the results unchanged. The belief is copied into planes with a margin, so that cells at the
+//! edge need no special treatment, and many cells are computed at once. In addition, the beliefs at taps with equal
+//! weights are added before they are multiplied (`rows.rs`). Every lane performs the same operations in the same order,
+//! and no operation is fused, so results are bit-identical on every platform.
 
 mod layout;
 mod rows;
@@ -32,7 +32,7 @@ use ndarray::{Array3, Array4, NdFloat};
 use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
 use std::sync::Arc;
 
-/// The operator `Phi` for one model on one grid, with its buffers. Each thread needs a clone.
+/// The operator `Phi` for one model on one grid, with its buffers. Each thread needs its own clone.
 ///
 /// The programs use `f32`; tests also use `f64`.
 #[derive(Debug, Clone)]
@@ -77,8 +77,8 @@ impl<T: NdFloat> Transition<T> {
     /// Prepares the operator for a grid from weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd `KH` and `KW`,
     /// and biases `b[m]`.
     ///
-    /// There is one kernel, or one per own state of the cell. All weights must be finite and 0 or more. If all
-    /// weights of a cell are 0, its prediction is NaN.
+    /// `kernels` contains one kernel, or one for each own state (the state of the cell itself). All weights must be
+    /// finite and 0 or more. If all weights of a cell are 0, its prediction is NaN.
     pub fn of_weights(kernels: &[Array4<f64>], bias: &[f64], shape: Shape) -> Self {
         Self::on_land(kernels, bias, shape, (None, 1))
     }

@@ -76,7 +76,7 @@ fn check_phi<T: NdFloat + ReadableElement>(model: &Model, sizes: &[&str], end: &
 fn phi_matches_the_reference_on_states_and_beliefs() {
     let mut sizes = vec!["1x1", "2x2", "3x3", "5x5", "4x7", "1x6"];
     // In double precision, the test uses the reference's kernel, which was converted from f32. The exact parameters
-    // differ from it by 6e-9.
+    // differ from this kernel by 6e-9.
     let mut file = Model::wildfire().file().clone();
     let kernel: Array4<f32> = array(&mut npz("a1_transition.npz"), "kernel");
     for entry in &mut file.kernel {

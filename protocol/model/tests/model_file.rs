@@ -1,4 +1,4 @@
-//! docs/model-file.md: the examples are valid models, and the page names every key and its limits.
+//! Checks that the examples in docs/model-file.md are valid models, and that the page names every key and its limits.
 
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::text::MAX_TEXT_BYTES;

@@ -20,8 +20,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Minimum age at which a file of a living process can count as left over. A client that takes no turns may still be
-/// creating a younger file.
+/// Minimum age at which a file of a living process can count as left over. A client that does not take the lock of
+/// `turn.rs` may still be creating a younger file.
 const MAKING: Duration = Duration::from_secs(1);
 
 /// The folders of channel files, and the prefix of their names.
@@ -56,8 +56,8 @@ impl ChannelFiles {
         Ok(None)
     }
 
-    /// Returns whether a segment is unfinished: it is empty, or not yet readable. The memory of a living port grows
-    /// without a turn and is opened only when it is finished, so it does not count as unfinished.
+    /// Returns whether a segment is unfinished: it is empty, or not yet readable. The memory of a living port does not
+    /// count as unfinished: it grows without the lock of `turn.rs`, but is opened only when it is finished.
     pub(super) fn is_unfinished(&self, segment: &Path) -> Result<bool, Error> {
         let unfinished = |found: Metadata| found.len() == 0 || found.mode() & 0o400 == 0;
         let grows =
@@ -178,7 +178,7 @@ pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<
 /// none.
 pub fn lives_elsewhere(node: u128) -> bool {
     let monitor = format!("nodes/{}{node}.node_monitor", prefix());
-    // Opening and closing the file here would release the lock of a node of this process.
+    // If this process has the node, opening and closing the file here would release the node's lock.
     if own_nodes::has(node) {
         return false;
     }
@@ -194,8 +194,8 @@ fn service_id(text: &str) -> Option<u128> {
     Some(half("unique_value")? << 64 | half("payload_value")?)
 }
 
-/// Returns whether the object with this id may still be being created. The id contains the process that creates it, and
-/// the time at which this began.
+/// Returns whether the object with this id may still be under construction. The id contains the process that creates
+/// the object, and the time at which its creation began.
 pub(super) fn is_in_the_making(id: u128) -> Result<bool, Error> {
     let (seconds, nanos) = (id as u32, (id >> 32) as u32);
     let age = since_boot().saturating_sub(Duration::new(seconds.into(), nanos));
@@ -217,7 +217,7 @@ pub(super) fn since_boot() -> Duration {
     Duration::new(now.tv_sec as u64, now.tv_nsec as u32)
 }
 
-/// Returns whether a file is writable, as a tag or a node's details are until they are finished.
+/// Returns whether a file is writable. Tags and the details of nodes are writable until they are finished.
 pub(super) fn is_writable(file: &Path) -> Result<bool, Error> {
     Ok(metadata(file)?.is_some_and(|found| found.mode() & 0o200 != 0))
 }

@@ -50,7 +50,7 @@ pub const AGENT_BUFFER: usize = 4;
 /// Maximum number of processes attached to an instance at a time.
 pub const MAX_NODES: usize = 64;
 
-/// A request-response service of bytes with headers `Q` and `R`.
+/// A request-response service whose messages are bytes, with the headers `Q` and `R`.
 pub type RequestResponse<Q, R> =
     request_response::PortFactory<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
@@ -60,7 +60,7 @@ pub type StepService = RequestResponse<StepRequest, StepReply>;
 /// The `control` service.
 pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
 
-/// A publish-subscribe service of bytes with header `H`.
+/// A publish-subscribe service whose samples are bytes, with the header `H`.
 pub type Publications<H> = publish_subscribe::PortFactory<Ipc, [u8], WireHeader<H>>;
 
 /// The `frames` service.
@@ -88,9 +88,9 @@ pub enum Channel {
     Truth,
     /// Beliefs of agents, publish-subscribe.
     Agent,
-    /// Wakes the server, event.
+    /// Wake-ups of the server, event.
     WakeServer,
-    /// Wakes clients, event.
+    /// Wake-ups of clients, event.
     WakeClient,
 }
 
@@ -215,7 +215,7 @@ impl Services<'_> {
     /// If iceoryx2 can neither open nor create it.
     pub fn listener(&self, channel: Channel) -> Result<Listener<Ipc>, ChannelError> {
         // iceoryx2 0.10 changes the umask of the process while it binds a listener's socket. If two threads did this at
-        // once, the second would restore the umask that the first had set, permanently.
+        // once, the second could permanently restore the umask that the first had set only for a moment.
         static BINDING: Mutex<()> = Mutex::new(());
         let wake = self.wake(channel)?;
         let _alone = BINDING.lock().unwrap_or_else(PoisonError::into_inner);

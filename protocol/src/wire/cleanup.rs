@@ -1,8 +1,9 @@
 //! Removes the files of dead processes. A process may have died at any instruction, even while it started or ended.
 //!
-//! During a [`Turn`] no other process creates or removes anything. So every file either belongs to a node whose process
-//! lives, or to a service that such a node uses, or it is left over. iceoryx2 itself removes dead nodes from services
-//! that are still in use. But it cannot remove unfinished files, and it waits forever for an empty segment to grow.
+//! While a process holds the lock (during a [`Turn`]), no other process creates or removes anything. So every file
+//! belongs to a node whose process lives, belongs to a service that such a node uses, or is left over. iceoryx2 itself
+//! removes dead nodes from services that are still in use. But it cannot remove unfinished files, and it waits forever
+//! for an empty segment to grow.
 //!
 //! Names of files:
 //!
@@ -11,8 +12,8 @@
 //! - Segments are `<prefix><hash>_<id>[_<id>].<kind>`, sockets `<prefix><id>.event`. A hash contains letters or at
 //!   least 40 digits; an id has at most 39 decimal digits. The low three 32-bit words of an id are the time of its
 //!   creation (seconds and nanoseconds of `CLOCK_MONOTONIC`) and the process that created it.
-//! - A finished tag cannot be written to. A finished segment can be read and is not empty, but the `.data` of a living
-//!   port grows without a turn.
+//! - A finished tag cannot be written to. A finished segment can be read and is not empty. An exception is the `.data`
+//!   of a living port, which grows without the lock.
 //!
 //! The cleanup lists files before nodes and tags. It keeps files that appeared later, and files whose id a living
 //! process created less than a second ago. First it removes unfinished segments, except `.data` of living processes and
@@ -59,8 +60,8 @@ pub fn remove_leftovers() -> Result<usize, ChannelError> {
     removed.map_err(|error| not_usable(&channel_directory(), error))
 }
 
-/// Removes the files of dead processes, and waits until processes without turns have finished the segments that they
-/// are creating. Otherwise iceoryx2 could wait forever for an unfinished segment.
+/// Removes the files of dead processes, and waits until processes that do not take the lock have finished the segments
+/// that they are creating. Otherwise iceoryx2 could wait forever for an unfinished segment.
 pub(crate) fn make_way() -> Result<(), ChannelError> {
     await_finished(&ChannelFiles::of_user(), || {
         if let Err(error) = remove_leftovers() {
@@ -92,8 +93,8 @@ impl ChannelFiles {
     /// Removes the files of dead processes. Stops at the first error, because an unreadable file may belong to a living
     /// process.
     fn remove_leftovers(&self, config: &Config) -> Result<usize, Error> {
-        // Files are listed before nodes and tags, so that the list does not include files that a client without turns
-        // creates meanwhile.
+        // Files are listed before nodes and tags, so that the list does not include files that a client creates
+        // meanwhile without taking the lock.
         let list = |folder: &str| entries(&self.root.join(folder));
         let (node_files, services) = (list("nodes")?, list("services")?);
         let mut ports = self.segments()?;
@@ -107,7 +108,7 @@ impl ChannelFiles {
             n_removed += remove_if(entries(&self.folder(id))?, is_writable)?;
             let has_details = node.details().is_some();
             let details = self.folder(id).join(format!("{}node.details", self.prefix));
-            // A node without details uses no service, because the details are removed last.
+            // A node's details are removed last, so a node whose details are gone uses no service any more.
             let is_shared =
                 has_details && !used.hashes.is_disjoint(&self.tags(id, ".service_tag")?);
             let is_unread = !has_details && metadata(&details)?.is_some();
@@ -126,7 +127,8 @@ impl ChannelFiles {
     fn remove_unfinished(&self, used: &Used) -> Result<usize, Error> {
         remove_if(self.segments()?, |path| {
             let ids = self.ids(path);
-            // A living port in another PID namespace may be creating the segment, and its process cannot be checked.
+            // Keeps segments of living ports: a port in another PID namespace may be creating the segment, and its
+            // process cannot be checked.
             let is_of_living = !ids.is_empty() && ids.iter().all(|id| used.ids.contains(id));
             Ok(self.is_unfinished(path)? && !is_of_living && !any(&ids, is_in_the_making)?)
         })
@@ -155,7 +157,7 @@ impl ChannelFiles {
     }
 }
 
-/// Removes the files and folders that are left over, and returns their number.
+/// Removes the files and folders for which `is_left` returns true, and returns their number.
 fn remove_if(
     paths: Vec<PathBuf>,
     is_left: impl Fn(&Path) -> Result<bool, Error>,
@@ -300,8 +302,8 @@ mod tests {
         assert!(is_young, "ids are of our clock: {port}");
         let hash = "0123456789abcdef".repeat(3)[..40].to_owned();
         let segment = |name: String| files.shared.join(format!("{prefix}{hash}_{name}"));
-        // Three files that must stay: the memory of a growing port, the memory of a port that a client without turns is
-        // creating, and a connection to a living port.
+        // Three files that must stay: the memory of a growing port, the memory of a port that a client is creating
+        // without the lock, and a connection to a living port.
         make(segment(format!("{port}__2.data")), 0o200);
         make(segment(format!("{new}.dynamic")), 0o200);
         create_dir(root.join(format!("nodes/{new}"))).expect("a folder");

@@ -31,8 +31,8 @@ type StepClient = RequestClient<StepRequest, StepReply>;
 
 struct Ports {
     step: Option<StepClient>,
-    /// Kept open because the service owns one of the entries. If it were closed before the ports, the entries would
-    /// seem to belong to another program.
+    /// Kept open because the service owns one of the files that [`Opened`] checks before it closes the ports. If the
+    /// service were closed first, the check would find this file missing.
     step_service: StepService,
     texts: TextPort,
 }

@@ -112,7 +112,7 @@ pub fn node_config() -> Result<Config, ChannelError> {
     let mut config = Config::default();
     config.global.set_root_path(&path);
     config.global.prefix = prefix;
-    // Cleaning up needs a turn (`turn.rs`), and iceoryx2 takes none.
+    // Cleaning up needs the lock of `turn.rs`, which iceoryx2 does not take.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;

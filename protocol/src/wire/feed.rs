@@ -7,11 +7,11 @@ use emberwatch_model::grid::Probabilities;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Time between two published beliefs of a world. No screen is faster, and each published belief costs a copy.
+/// Time between two published beliefs of a world. Displays need no higher rate, and each published belief costs a copy.
 const INTERVAL: Duration = Duration::from_millis(20);
 
-/// Maximum time that [`Feed::end`] waits for readers to receive the last belief. A reader that has not connected by
-/// then cannot receive it once the process has ended.
+/// Maximum time that [`Feed::end`] waits for readers to receive the last belief. A reader that connects later cannot
+/// receive it, because the process has ended.
 const FAREWELL: Duration = Duration::from_millis(500);
 
 /// The beliefs that the agents of one process publish.
@@ -41,8 +41,8 @@ pub struct View<'a> {
 }
 
 impl Feed {
-    /// Opens the channel for beliefs of the same size as `belief`. If it cannot be opened, it logs one warning and
-    /// publishes nothing, because acting does not depend on being observed.
+    /// Opens the channel for beliefs of the same size as `belief`. If the channel cannot be opened, logs one warning
+    /// and publishes nothing, because an agent must act even if nobody can watch it.
     pub fn open(instance: &Instance, belief: &Probabilities) -> Self {
         // The intent is a few hundred bytes of text.
         let n_bytes = belief.len() * size_of::<f32>() + 1024;
@@ -108,8 +108,8 @@ impl Feed {
 }
 
 impl Turns {
-    /// Returns the worlds that are due, in rotation. There are at most as many as fit in a reader's buffer together
-    /// with one unread belief.
+    /// Returns the worlds whose beliefs are due, in round-robin order. Their number is limited so that their beliefs
+    /// and one unread belief fit in a reader's buffer.
     fn due(&self, now: Instant, n_worlds: usize) -> Vec<usize> {
         let share = |shown: Instant| (now - shown).as_secs_f64() / INTERVAL.as_secs_f64();
         let n_due = self

@@ -1,4 +1,4 @@
-//! The variant of iceoryx2, and headers in its shared memory.
+//! The service variant of iceoryx2 that all channels use, and the headers in its shared memory.
 
 use emberwatch_messages::message::Header;
 use iceoryx2::prelude::ZeroCopySend;

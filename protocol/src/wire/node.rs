@@ -32,12 +32,12 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
         .signal_handling_mode(SignalHandlingMode::Disabled);
     let node = node.create().map_err(ipc_error("create a node"))?;
     own_nodes::add(node.id().value());
-    // iceoryx2 creates the counter of nodes with the first node, and makes it writable for everybody.
+    // iceoryx2 creates its node counter together with the first node, and makes the counter writable for everybody.
     own_segments(shared_memory, &prefix())?;
     Ok(node)
 }
 
-/// Ports and their node, which are closed during a turn.
+/// Ports and their node, which are closed while this process holds the lock of `turn.rs`.
 #[derive(Debug)]
 pub(crate) struct Opened<T> {
     ports: Option<T>,
@@ -45,7 +45,7 @@ pub(crate) struct Opened<T> {
 }
 
 impl<T> Opened<T> {
-    /// Wraps the ports of the node that has these entries.
+    /// Wraps ports. `entries` are the files of their node.
     pub(crate) fn new(entries: Entries, ports: T) -> Self {
         Self {
             ports: Some(ports),
@@ -78,7 +78,8 @@ impl<T> Drop for Opened<T> {
         let _turn = Turn::take_to_end();
         let ports = self.ports.take();
         if self.entries.check().is_err() {
-            // Other programs may have created files with the same names meanwhile.
+            // Closing the ports would remove their files, but other programs may have created files with the same names
+            // meanwhile.
             std::mem::forget(ports);
         }
     }

@@ -18,8 +18,8 @@ use std::cell::Cell;
 use std::time::{Duration, Instant};
 
 /// Time that an observer sleeps between two polls while it is busy. Publishing wakes no observer, so observers cost the
-/// server no system call. They do not spin either, which would take processor time from it. At 128,000 frames per
-/// second, [`FRAME_BUFFER`] fills up within this time.
+/// server no system call. Observers do not spin either, because spinning would take processor time from the server. At
+/// 128,000 frames per second, [`FRAME_BUFFER`] fills up within this time.
 const BUSY_INTERVAL: Duration = Duration::from_micros(500);
 
 /// Time that an observer sleeps between two polls while it is idle. Each poll wakes a process, on a core that the
@@ -31,7 +31,7 @@ const BUSY: Duration = Duration::from_secs(1);
 
 type Ports<H> = (Subscriber<Ipc, [u8], WireHeader<H>>, Node<Ipc>);
 
-/// A reader of one channel of an instance, whether a server runs or not.
+/// A reader of one channel of an instance. It can be opened before the server starts.
 pub struct Observer<H: Header> {
     ports: Opened<Ports<H>>,
     publisher: Cell<Option<u32>>,
@@ -50,7 +50,7 @@ struct Polling {
 }
 
 impl Observer<FrameHeader> {
-    /// Opens the frames of an instance. The server publishes every world's current frame at once.
+    /// Opens the frames of an instance. The server then immediately publishes the current frame of every world.
     ///
     /// # Errors
     /// If the channel cannot be opened, or has too many observers.
@@ -61,7 +61,7 @@ impl Observer<FrameHeader> {
 }
 
 impl Observer<TruthHeader> {
-    /// Opens the hidden states of an instance. They arrive only if its server publishes them.
+    /// Opens the hidden states of an instance. They arrive only if the instance's server publishes them.
     ///
     /// # Errors
     /// If the channel cannot be opened, or has too many readers.
@@ -123,16 +123,17 @@ impl<H: Header> Observer<H> {
         })
     }
 
-    /// Makes the observer always poll every 500 us. Use it if the first samples after a pause must not be lost: within
-    /// the usual 4 ms, the server may publish more samples than the buffer can hold.
+    /// Makes the observer always poll every 500 us. Use it if the first samples after a pause must not be lost: between
+    /// two polls of an idle observer, which are 4 ms apart, the server may publish more samples than the buffer can
+    /// hold.
     #[must_use]
     pub fn eager(mut self) -> Self {
         self.polling.is_eager = true;
         self
     }
 
-    /// Waits for the next sample. Returns `None` if none came in time. A gap in the headers' sequence numbers means
-    /// that this observer was too slow and lost samples.
+    /// Waits for the next sample. Returns `None` if no sample arrived in time. A gap in the headers' sequence numbers
+    /// means that this observer was too slow and lost samples.
     ///
     /// # Errors
     /// If iceoryx2 cannot read the channel, or its files were removed.
@@ -173,7 +174,7 @@ impl<H: Header> Observer<H> {
         }))
     }
 
-    /// Returns the process that published the last received sample: the server's, or an agent's.
+    /// Returns the process id of the server or agent that published the last received sample.
     pub fn publisher(&self) -> Option<u32> {
         self.publisher.get()
     }

@@ -12,7 +12,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 #[derive(Debug)]
 pub struct WatchedProcess(OwnedFd);
 
-/// The error for a process of `--exit-with` that does not run or cannot be watched.
+/// The error if the process that `--exit-with` names does not run or cannot be watched.
 #[derive(Debug, thiserror::Error)]
 pub enum NotWatched {
     /// There is no such process.

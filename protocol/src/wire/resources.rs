@@ -17,10 +17,11 @@ pub const SHARED_MEMORY: &str = "/dev/shm";
 /// Advice if the folder is full.
 pub(super) const REMEDY: &str = "free some, or give the container more (docker: --shm-size)";
 
-/// Shared memory of the ports of a client or an observer in bytes, except its longest messages. Measured: 190 KiB.
+/// Shared memory in bytes that the ports of a client or an observer need, in addition to the memory for their longest
+/// messages. Measured: 190 KiB.
 const PORT_BYTES: u64 = 512 << 10;
 
-/// Number of files of these ports. Measured: 25.
+/// Number of files that the ports of a client or an observer need. Measured: 25.
 const PORT_FILES: u64 = 48;
 
 /// Number of file descriptors of a connection to a server or an agent. Measured: 31, and briefly one more.
@@ -58,7 +59,7 @@ pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
         ));
     }
     check_free(n_bytes)?;
-    // A file system without a limit on files reports 0 of 0.
+    // A file system without a limit on the number of files reports 0 free files of 0.
     let found = statvfs(SHARED_MEMORY).ok();
     let found = found.filter(|found| found.f_files > 0 && found.f_favail < PORT_FILES);
     found.map_or(Ok(()), |found| {
@@ -117,15 +118,15 @@ pub fn limited_error<E: Debug>(
     }
 }
 
-/// Checks that the system allows sockets, which wake other processes.
+/// Checks that the system allows sockets, which are needed to wake other processes.
 fn check_sockets() -> Result<(), ChannelError> {
     let socket = UnixDatagram::unbound();
     let errno = socket.err().and_then(|error| Errno::from_io_error(&error));
     errno.map_or(Ok(()), |errno| Err(call_error("socket (AF_UNIX)", errno)))
 }
 
-/// Checks that `needed` descriptors are free before any is used. If an operation of iceoryx2 fails halfway, its
-/// descriptors may stay open.
+/// Checks that `needed` descriptors are free before any is used, because an iceoryx2 operation that fails halfway may
+/// leave descriptors open.
 pub(super) fn check_descriptors(what: &'static str, needed: usize) -> Result<(), ChannelError> {
     free_descriptors(needed).map_err(|_| no_descriptors(what, needed))
 }

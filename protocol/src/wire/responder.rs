@@ -26,7 +26,7 @@ pub const JSON_SLICE: usize = 16_384;
 /// Maximum number of known listeners. A full table is emptied.
 const MAX_KNOWN_LISTENERS: usize = 1024;
 
-/// Maximum time that a sender waits for clients to read its last answers before it ends.
+/// Maximum time that an ending sender waits for clients to read its last answers.
 const LAST_ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A request that is waiting for its answer.

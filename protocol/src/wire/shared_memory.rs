@@ -61,7 +61,7 @@ impl MessageMemory {
     pub fn of(port: u128, n_messages: usize, message_bytes: usize) -> Result<Self, ChannelError> {
         let files = ChannelFiles::of_user();
         let wrong = |error: std::io::Error| not_usable(SHARED_MEMORY.as_ref(), error);
-        // iceoryx2 numbers the files of memory that can grow.
+        // If the memory of a port can grow, iceoryx2 numbers its files.
         let ends = [format!("_{port}.data"), format!("_{port}__0.data")];
         let is_of_port = |path: &PathBuf| {
             let name = path.file_name().unwrap_or_default().to_string_lossy();

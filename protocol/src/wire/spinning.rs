@@ -1,5 +1,5 @@
-//! Decides whether a wait spins or blocks at once, from the success of earlier waits. It reads no clock; time is an
-//! argument.
+//! Decides whether a wait spins or blocks at once, from the success of earlier waits. It reads no clock: the caller
+//! passes the current time.
 //!
 //! If each process has a core, spinning takes about 1 us and blocking about 50 us, mostly to wake an idle core. If
 //! other processes keep the cores busy, blocking is faster: a spinning process uses up its time slice, while a blocked
@@ -9,17 +9,17 @@
 use std::time::{Duration, Instant};
 
 /// Time to poll before blocking. It is longer than it takes to wake a process that answers at once, so that two
-/// processes that block can find out that spinning pays.
+/// processes that both block can find out that spinning is faster.
 const SPIN: Duration = Duration::from_micros(100);
 
-/// If the time between two polls exceeds this, a busy process had the core meanwhile. It is shorter than a time slice,
-/// and longer than short pieces of work, such as handing a snapshot to a writer.
+/// If the time between two polls exceeds this limit, another process was running on the core meanwhile. The limit is
+/// shorter than a time slice, and longer than short pieces of work, such as handing a snapshot to a writer.
 const LOST_CORE: Duration = Duration::from_millis(1);
 
-/// Number of consecutive waits longer than [`SPIN`] after which spinning does not pay.
+/// Number of consecutive spins without success (waits longer than [`SPIN`]) after which waits stop spinning.
 const VAIN_SPINS: u32 = 3;
 
-/// Time for which waits then block at once. After it, one wait tries spinning again.
+/// Time during which waits then block at once. After this time, one wait tries spinning again.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// The record of earlier waits, from which the next ones decide whether to spin.
@@ -70,8 +70,8 @@ impl Spinning {
 mod tests {
     use super::*;
 
-    /// For each wait: its start in microseconds; the times of its polls without success after the start; the poll at
-    /// which it blocks; and whether something arrives then.
+    /// For each wait: its start in microseconds; the times of its unsuccessful polls, relative to the start; the time
+    /// of the poll after which it blocks; and whether something arrives in the end.
     type Waits<'a> = &'a [(u64, &'a [u64], Option<u64>, bool)];
 
     fn check(waits: Waits<'_>) {

@@ -20,7 +20,8 @@ use std::time::{Duration, Instant};
 /// Maximum wait for other processes, each of which holds the turn for milliseconds.
 const LONGEST_WAIT: Duration = Duration::from_secs(10);
 
-/// Maximum wait before closing and cleaning up, which can also be done without a turn, or by the next program.
+/// Maximum wait before closing and cleaning up, after which ports are closed without a turn, and cleaning up is left to
+/// the next program.
 const SHORT_WAIT: Duration = Duration::from_secs(1);
 
 /// Time after which a waiting process checks which process has the turn, and whether it is stopped.
@@ -89,7 +90,8 @@ impl Turn {
         Self::take_unless(limit, check_interrupt)
     }
 
-    /// Waits as [`Self::take`] does, but only shortly and without interrupts. It is for closing ports and cleaning up.
+    /// Waits as [`Self::take`] does, but only briefly, and without checking for interrupts. It is for closing ports and
+    /// cleaning up.
     pub(crate) fn take_to_end() -> Result<Self, ChannelError> {
         Self::take_unless(SHORT_WAIT, || Ok(()))
     }
@@ -116,7 +118,7 @@ impl Turn {
         Ok(Self { is_outermost, lock })
     }
 
-    /// Returns whether this thread has the lock, so that no other process is active.
+    /// Returns whether this thread has the lock, so that no other process creates or removes anything.
     pub fn is_alone(&self) -> bool {
         HELD.get() == Held::Alone
     }

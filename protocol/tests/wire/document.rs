@@ -29,7 +29,7 @@ pub fn rows_under(header: &str) -> Vec<Vec<String>> {
     rows(rest)
 }
 
-/// Returns the byte table of a struct, and its `struct` format.
+/// Returns the documented layout of a struct, and its documented Python `struct` format.
 pub fn documented_struct(name: &'static str) -> (Layout, String) {
     let start = format!("\n### {name}: `");
     let (_, rest) = PROTOCOL.split_once(&start).expect(name);
@@ -64,7 +64,8 @@ fn field(row: Vec<String>) -> Field {
     }
 }
 
-/// Returns the fenced blocks of a language. Each has the title after the language, and the text.
+/// Returns the fenced blocks of a language. Each block is returned as the title after the language, and the text of the
+/// block.
 pub fn fences(language: &str) -> Vec<(&'static str, &'static str)> {
     let blocks = PROTOCOL.split("\n```").skip(1).step_by(2);
     blocks
@@ -166,7 +167,7 @@ fn bytes_of_hex(text: &str) -> Vec<u8> {
     text.split(' ').map(byte).collect()
 }
 
-/// Returns the rows of a table. `rest` is the document from within the table's header line.
+/// Returns the rows of a table. `rest` is the rest of the document, beginning inside the header line of the table.
 fn rows(rest: &str) -> Vec<Vec<String>> {
     let lines = rest.lines().skip(2);
     let cells = |line: &str| {

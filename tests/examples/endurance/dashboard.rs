@@ -7,7 +7,8 @@ use tests::harness::{Program, Server};
 use tests::meter::{Use, processor_seconds};
 use tests::report::say;
 
-/// A dashboard on a server, optionally with a browser. On drop, prints the resources that the dashboard used.
+/// A dashboard that shows a server, optionally open in a browser. When dropped, prints the resources that the dashboard
+/// used.
 struct Audience {
     dashboard: Program,
     browser: Option<Program>,
@@ -15,7 +16,8 @@ struct Audience {
     _profile: TempDir,
 }
 
-/// Compares the time of a step on a square grid without a dashboard, with one, and with one that Chromium shows.
+/// Compares the time of a step on a square grid without a dashboard, with a dashboard, and with a dashboard that is
+/// open in Chromium.
 pub fn compare(n_rounds: usize, side: usize) {
     let audience = |with_dashboard: bool, with_browser: bool| {
         move |server: &Server| with_dashboard.then(|| Audience::attend(server, with_browser))

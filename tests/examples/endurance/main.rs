@@ -1,4 +1,5 @@
-//! Measures the cost of observers, dashboards and snapshots to a server, and the effect of hours of changing clients.
+//! Measures how much observers, dashboards and snapshots slow a server, and how a server fares when clients come and go
+//! for hours.
 //!
 //! `cargo run --release -p tests --example endurance -- observers 5 | dashboard 5 64 | snapshots 9 | soak 3600 FOLDER`
 

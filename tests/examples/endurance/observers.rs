@@ -15,7 +15,7 @@ use tests::stepper::Stepper;
 
 const N_STEPS: usize = 20_000;
 
-/// Prints the server's time and the round trip of a step for each number of observers, over `n_rounds` rounds.
+/// Measures a step for each number of observers in `n_rounds` rounds. Prints the server's time and the round trip.
 pub fn compare(n_rounds: usize) {
     let audiences = [0, 1, 4, 16].map(|n_observers| {
         let attend = move |server: &Server| -> Vec<Program> {
@@ -26,8 +26,8 @@ pub fn compare(n_rounds: usize) {
     table(n_rounds, "--burn-in 1000", &audiences);
 }
 
-/// Prints, for each audience, the median and 99th percentile of the server's time and of the round trip. For each of
-/// these quantiles, prints the median, minimum and maximum over the rounds.
+/// Prints, for each audience (a set of observers or dashboards), the median and 99th percentile of the server's time
+/// and of the round trip. For each of these quantiles, prints the median, minimum and maximum over the rounds.
 pub fn table<A, T>(n_rounds: usize, flags: &str, audiences: &[(String, A)])
 where
     A: Fn(&Server) -> T,
@@ -63,7 +63,7 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let mut last = Instant::now();
     for n in 0..N_STEPS {
         let path = path_to_bytes(&paths.next(info.n_moves));
-        // Limits the rate to 2,000 steps per second, as an agent's planning would.
+        // Limits the rate to 2,000 steps per second, because an agent's planning also limits its rate.
         while last.elapsed() < Duration::from_micros(500) {
             std::hint::spin_loop();
         }

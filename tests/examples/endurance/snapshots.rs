@@ -1,4 +1,5 @@
-//! Measures how much `--snapshot-every 1000`, with a temporary folder, slows a client that steps as fast as it can.
+//! Measures how much automatic snapshots (`--snapshot-every 1000`, to a temporary folder) slow a client that steps as
+//! fast as it can.
 
 use emberwatch_protocol::path::path_to_bytes;
 use std::time::Instant;
@@ -9,7 +10,7 @@ use tests::stepper::Stepper;
 
 const N_STEPS: usize = 100_000;
 
-/// Measures the time of a step alternately without and with snapshots. Prints both times and their ratio.
+/// Measures the time of a step without and with snapshots, alternately. Prints both times and their ratio.
 pub fn compare(n_rounds: usize) {
     let (mut without, mut with, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
     for round in 0..n_rounds {

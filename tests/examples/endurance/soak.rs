@@ -1,5 +1,6 @@
-//! Runs a server for hours while agents and observers start, end, are killed, stopped and taken over, and snapshots are
-//! written. Writes the server's resource usage, second by second, as a CSV file and as a figure.
+//! Runs a server for hours. Meanwhile agents and observers start, end, are killed or stopped and lose their robots to
+//! other agents, and snapshots are written. Writes the server's resource usage, second by second, as a CSV file and as
+//! a figure.
 
 use emberwatch_figures::{Curve, Lines, Panel, Scale};
 use rand::RngExt;

@@ -43,24 +43,25 @@ const N_INPUTS: usize = 256;
 /// Number of inputs from one step of the victim to the next.
 const VICTIM_STEPS: usize = 8;
 
-/// The two undisturbed clients: the victim in its own world, and its second client in the shared world.
+/// The victim's two clients, which must not be disturbed: one in its own world, the other in the shared world.
 const VICTIM: ClientId = ClientId { node: 1, pid: 1 };
 const SHARER: ClientId = ClientId { node: 4, pid: 4 };
 
 /// The attacking clients. The first one holds the attackers' robots.
 pub const ATTACKERS: [ClientId; 2] = [ClientId { node: 2, pid: 2 }, ClientId { node: 3, pid: 3 }];
 
-/// A simulator with its simulated clock and its waiting requests.
+/// A simulator under attack, with the simulated clock and the requests that wait.
 pub struct Siege {
     pub simulator: Simulator,
     pub now: Instant,
     pub jobs: Vec<ResetJob>,
     pub pending: Vec<(ClientId, PendingReply)>,
-    /// The victim's lease, then the attackers' latest leases, then the victim's lease in the shared world.
+    /// The leases, in this order: the victim's in its own world, the latest two of the attackers, the victim's in the
+    /// shared world.
     pub leases: [u64; 4],
-    /// The attacker's waiting step, and the time at which it was sent.
+    /// The attacker's step request that waits, and the time at which it was sent.
     pub attackers_step: Option<(Ticket, Instant)>,
-    /// The victim's waiting step in the shared world, and its path.
+    /// The victim's step request that waits in the shared world, and its path.
     shared_step: Option<(Ticket, Vec<u8>)>,
     /// The expected state of the shared world.
     mirror: Episode,
@@ -172,7 +173,8 @@ impl Siege {
         }
     }
 
-    /// Steps the victim's world, which must evolve as if alone. Then sends or cancels a step in the shared world.
+    /// Steps the victim's world and checks that it evolves as if there were no attacker. Then sends or cancels a step
+    /// in the shared world.
     fn victim_steps(&mut self) {
         static QUIET: OnceLock<Vec<(StepReply, Vec<u8>)>> = OnceLock::new();
         let steps = QUIET.get_or_init(|| {
@@ -187,7 +189,7 @@ impl Siege {
             "the victim's step {number} differs"
         );
         match self.shared_step.take_if(|_| number % 2 == 1) {
-            // A cancelled path must never be flown.
+            // A path whose request was cancelled must never be flown.
             Some((ticket, _)) => self.simulator.cancel_step(self.now, ticket),
             None => self.fly_shared(),
         }
@@ -207,7 +209,7 @@ impl Siege {
         (reply, payload)
     }
 
-    /// Sends a path for the victim's robot in the shared world, unless one is waiting.
+    /// Sends a path for the victim's robot in the shared world, unless such a request is already waiting.
     pub fn fly_shared(&mut self) {
         if self.shared_step.is_some() || self.mirror.is_over() {
             return;
@@ -229,7 +231,7 @@ impl Siege {
         self.check_shared();
     }
 
-    /// Collects the answers to waiting steps, and checks that the shared world agrees with its paths.
+    /// Collects the answers to waiting step requests, and checks that the shared world has moved as its paths imply.
     pub fn check_shared(&mut self) {
         let (mut payload, mut waited) = (Vec::new(), Duration::ZERO);
         let before = self.mirror.outcome().step;
@@ -253,7 +255,8 @@ impl Siege {
         assert!(is_due, "the victim was not waited for");
     }
 
-    /// If the shared world has stepped, repeats the step in the mirror. `path` is the victim's path, if answered.
+    /// If the shared world has stepped, repeats the step in the mirror. `path` is the victim's path if its request was
+    /// answered.
     fn check_shared_step(&mut self, path: Option<&[u8]>) {
         let episode = self.simulator.episode(SHARED);
         let episode = episode.expect("only a client that holds both robots can reset it");

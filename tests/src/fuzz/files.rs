@@ -85,7 +85,7 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
     for step in 0..N_STEPS {
         dynamics.step(1, step, &mut states);
     }
-    // The index panics if a state does not exist.
+    // Indexing panics if a state does not exist.
     let rewards = states
         .iter()
         .map(|state| model.reward()[usize::from(*state)]);
@@ -93,8 +93,8 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
     assert!(reward.is_finite(), "the reward sums to {reward}");
 }
 
-/// Checks that a checkpoint is refused, or that its numbers are finite and a learner resumes from it or refuses it. The
-/// digest is corrected first, because it protects against damage, not against attackers.
+/// Checks that a checkpoint is refused, or that its numbers are finite and a learner either resumes from it or refuses
+/// it. First corrects the digest, because it protects only against damage, not against attackers.
 pub fn checkpoint(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     let mut learned = learners::from_bytes(&bytes);
@@ -115,7 +115,8 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         let n_matrices = filter.tables.dimensions.n_matrices as f64;
         let sums = likelihood.sum_axis(Axis(1)) / n_matrices;
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
-        // Checkpoints of decisions also contain a filter, but a filter learner resumes only from a filter's checkpoint.
+        // Checkpoints of the decisions learner also contain a filter, but a filter learner can resume only from its own
+        // checkpoints.
         if learners::filter::FILTER.checkpoints.contains(&&*kind) {
             learn(&contents, filter.tables.dimensions.sees_own_state);
         }
@@ -131,13 +132,14 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
     true
 }
 
-/// Resumes from a filter's checkpoint, if a learner accepts it.
+/// Resumes from a filter's checkpoint, if the learner accepts it, and may run an update.
 fn learn(contents: &Contents, sees_own_state: bool) {
     let learner = FilterLearner::resume(contents, dimensions(sees_own_state), worlds(), &config());
     if let Ok(mut learner) = learner {
         let again = learner.contents().expect("no device");
         let saved: SavedFilter = again.state().expect("its state");
-        // More updates would take too long. Learning may fail, because finite numbers can be too large to compute with.
+        // Skips learning if too many updates are due, which would take too long. Learning may fail, because finite
+        // numbers can overflow.
         let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
     }
 }
@@ -167,12 +169,12 @@ fn config() -> AgentConfig {
     config.learning.window = 2;
     config.learning.block_windows = 1;
     config.learning.streams = 2;
-    // With small networks, the files of the corpus stay small.
+    // Small networks keep the files of the corpus small.
     config.decisions.learning.width = 1;
     config
 }
 
-/// Returns the checkpoint of untrained decisions on an untrained filter.
+/// Returns the checkpoint of an untrained decisions learner with an untrained filter.
 fn decisions() -> Contents {
     let learner = DecisionsLearner::new(base_of_filter(), None, worlds(), &config());
     let mut contents = learner.and_then(|learner| learner.contents());
@@ -198,7 +200,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
         n_matrices: 2,
         ..dimensions(false)
     };
-    // The large autoencoder claims a size of 30 GiB, which no decoder may allocate.
+    // The large autoencoder claims a size of 30 GiB, but no decoder may allocate so much.
     [
         ("filter", "learned_filter", filter(dimensions(false))),
         ("own_filter", "learned_own_filter", filter(dimensions(true))),

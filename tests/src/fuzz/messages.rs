@@ -28,7 +28,8 @@ pub fn split_header<H: Pod>(bytes: &[u8]) -> Option<(H, &[u8])> {
     Some((bytemuck::pod_read_unaligned(header), payload))
 }
 
-/// Checks that an answer to a step splits completely into its parts, and that its frames contain valid observations.
+/// Checks that the parts of an answer to a step request add up to the whole payload, and that its frames contain valid
+/// observations.
 pub fn step_answer(bytes: &[u8]) -> bool {
     let Some((reply, payload)) = split_header::<StepReply>(bytes) else {
         return false;

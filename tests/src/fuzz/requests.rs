@@ -17,7 +17,8 @@ use std::time::Duration;
 /// The placeholder for the attacker's lease in a control request.
 const LEASE: &str = "LEASE";
 
-/// Handles a step request: a header of 56 bytes, and a payload whose steps k are relative to the current ones.
+/// Handles a step request, which consists of a header of 56 bytes and a payload. The steps k in the payload are
+/// relative to the current steps of the worlds.
 pub fn step(bytes: &[u8]) -> bool {
     split_header(bytes).is_some_and(|(request, body)| on_siege(|siege| siege.step(&request, body)))
 }
@@ -78,7 +79,7 @@ impl Siege {
         true
     }
 
-    /// Adds the worlds' current steps to the relative steps in a payload.
+    /// Replaces the relative steps in a payload by absolute ones, by adding the worlds' current steps.
     fn body_from_present(&self, request: &StepRequest, body: &[u8]) -> Vec<u8> {
         let mut body = body.to_vec();
         let end = u64::from(request.first_robot) + u64::from(request.n_robots);

@@ -41,8 +41,8 @@ fn spec() -> &'static WorldSpec {
     })
 }
 
-/// Checks that a snapshot is refused, or that its worlds can step and be reset. The checksum is corrected first,
-/// because it protects against damage, not against attackers.
+/// Checks that a snapshot is refused, or that its worlds can step and be reset. First corrects the checksum, because it
+/// protects only against damage, not against attackers.
 pub fn snapshot(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     if bytes.len() >= HEADER_BYTES {
@@ -79,7 +79,7 @@ fn flown(ready: u64, full: u64) -> Flown<'static> {
     }
 }
 
-/// Corrects a recording's checksums, then checks that the recording is refused or read to its end.
+/// Corrects a recording's checksums, then checks that the recording is either refused or read to its end.
 pub fn recording(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     mend(&mut bytes);
@@ -174,7 +174,8 @@ pub fn recording_seeds() -> Vec<Seed> {
     vec![("frame", bytes), ("cut", cut)]
 }
 
-/// Checks that an archive or array of three recorded states is refused, or that all its sequences have the same shape.
+/// Checks that an archive or array of recorded states (values 0 to 2) is refused, or that all its sequences are on the
+/// same grid.
 pub fn states(bytes: &[u8]) -> bool {
     let mut sequences = Sequences::new(3);
     let added = if bytes.starts_with(b"\x93NUMPY") {

@@ -6,7 +6,7 @@ use emberwatch_model::{Cell, Frame};
 use ndarray::{Array2, NdFloat};
 use thiserror::Error;
 
-/// An observation that is impossible under the belief.
+/// The error about an observation that is impossible under the belief.
 #[derive(Debug, Error, PartialEq)]
 #[error(
     "frame: cell {cell}: expected an observation that the belief {belief:?} allows, got {observed}"
@@ -18,7 +18,7 @@ pub struct ZeroEvidence {
     pub belief: Vec<f32>,
 }
 
-/// The generic form of [`ZeroEvidence`]: a cell's row-major index, and probabilities of any float type.
+/// The same error as [`ZeroEvidence`], but with the cell's row-major index and probabilities of any float type.
 #[derive(Debug, PartialEq)]
 pub struct Impossible<T> {
     pub index: usize,
@@ -44,8 +44,8 @@ pub fn observations(belief: &Belief, likelihood: &Array2<f64>) -> Probabilities 
     observations.expect("invariant: one number per observation and cell")
 }
 
-/// Applies Bayes' rule to the cells that a frame shows: `p = B(y) u / (b(y)' u)` (eq. 5). Other cells keep `p = u`.
-/// `likelihood` is `P(y | x)`, shape `[S, O]`.
+/// Applies Bayes' rule to the cells that a frame shows: `p = B(y) u / (b(y)' u)` (eq. 5). Cells that the frame does not
+/// show keep `p = u`. `likelihood` is `P(y | x)`, shape `[S, O]`.
 ///
 /// # Errors
 /// [`ZeroEvidence`] if `b(y)' u = 0` for some cell. The belief is then unchanged.
@@ -88,7 +88,7 @@ pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
     for (index, observed) in observed() {
         let prior = probabilities[index..].iter().step_by(n_cells);
         let likelihood = likelihood.column(usize::from(observed));
-        // Computed in f64, where the product of two f32 values cannot underflow to zero.
+        // Compute in f64, because the product of two f32 values can underflow to zero in f32, but not in f64.
         let joint = || {
             let pairs = prior.clone().zip(&likelihood);
             pairs.map(|(&u, b)| u.to_f64().unwrap_or(f64::NAN) * b)

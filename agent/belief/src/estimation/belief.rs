@@ -1,5 +1,5 @@
 //! A [`Belief`] consists of one probability distribution over states for each cell. Its constructors check or guarantee
-//! this.
+//! that these are valid distributions.
 //!
 //! Estimators compute beliefs (the `u` and `p` of paper eqs. 5 and 6), and objectives read them. An exploring robot is
 //! attracted to cells with high entropy (eq. 14).
@@ -10,8 +10,8 @@ use ndarray::{ArrayView2, ArrayView3, Axis};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Maximum deviation from 1 of the sum of a cell's probabilities: about 400 times the rounding error of an `f32`. A
-/// softmax or normalisation deviates less, and a bug deviates more.
+/// Maximum deviation from 1 of the sum of a cell's probabilities: about 400 times the rounding error of an `f32`. The
+/// rounding errors of a softmax or normalisation are smaller, and the errors caused by a bug are larger.
 const SUM_TOLERANCE: f32 = 5e-5;
 
 /// One distribution over states per cell, shape `[S, H, W]`. The probabilities of each cell sum to one.
@@ -42,7 +42,7 @@ pub enum BeliefError {
     /// A cell's values are not a probability distribution.
     #[error("belief of cell {cell}: expected probabilities >= 0 with sum 1, got {got:?}")]
     Simplex { cell: Cell, got: Vec<f32> },
-    /// The model has no such state.
+    /// A cell's state does not exist in the model.
     #[error("belief from states: cell {cell}: expected a state below {n_states}, got {got}")]
     State {
         cell: Cell,
@@ -235,8 +235,8 @@ impl From<Belief> for Probabilities {
 /// Computes the natural logarithm of a probability, with an error of a few units in the last place.
 ///
 /// The result at 0 is finite, so that `p * ln(p)` is 0 there. The code has no branches or calls, so that the compiler
-/// vectorises the loop over cells. The polynomial in `m - 1` is from `logf` of the Cephes library (S. Moshier), where
-/// `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`.
+/// vectorises the loop over cells. The argument is split into `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`. The
+/// polynomial in `m - 1` that approximates `ln(m)` is from `logf` of the Cephes library (S. Moshier).
 #[inline]
 fn ln(p: f32) -> f32 {
     const SQRT_HALF_BITS: u32 = 0x3f35_04f3;
@@ -295,7 +295,7 @@ mod tests {
     #[test]
     fn invalid_probabilities_are_rejected_with_their_cell() {
         let third = 1.0 / 3.0;
-        // The last two sum to 1, but contain negative numbers.
+        // The last two arrays sum to 1, but contain negative numbers.
         for states in [
             [third, third, 0.5],
             [third, third, 0.3],

@@ -2,9 +2,10 @@
 //! highest reward.
 //!
 //! There is one correlation for each pair of age ranges and each class of offsets. A cell's age is the number of steps
-//! since it was last seen. Ages are divided into `N_AGES` ranges. A class contains the offsets that differ only in
-//! direction. Learning needs no hidden states: if a frame shows two nearby cells, the product of their innovations
-//! estimates their covariance.
+//! since it was last seen. Ages are divided into `N_AGES` ranges. An offset is the distance between two cells in rows
+//! and columns, and a class contains all offsets that differ only in direction. Learning needs no hidden states: if a
+//! frame shows two nearby cells, the product of their innovations (posterior minus prior probability of the paying
+//! state) estimates their covariance.
 
 use crate::estimation::belief::Belief;
 use crate::estimation::innovation::Innovation;
@@ -40,14 +41,14 @@ pub const AGE_RANGES: [usize; 256] = {
 /// Number of classes of offsets: one for each `(a, b)` with `a <= b <= RADIUS`. Class 0 is the cell itself.
 const N_CLASSES: usize = (RADIUS + 1) * (RADIUS + 2) / 2;
 
-/// Weight of the mean over all older age ranges, as a number of cell pairs with variance 1. Pairs of age ranges with
-/// little data follow this mean.
+/// Weight of the mean correlation over all age ranges of the older cell, as a number of cell pairs with variance 1. The
+/// estimate for a pair of age ranges with little data stays close to this mean.
 const SHRINKAGE: f64 = 60.0;
 
 /// Maximum correlation between two cells.
 const LARGEST: f64 = 0.9;
 
-/// Upper bound of the sums in a valid file. No run observes that many pairs.
+/// Upper bound of the sums in a valid file. No run observes enough pairs of cells to exceed it.
 const MOST: f64 = 1e15;
 
 /// Correlations, and the sums over pairs of cells from which they are estimated.
@@ -82,10 +83,10 @@ pub struct Evidence {
     cell: Cell,
     /// The range of the cell's age before the frame.
     age: usize,
-    /// Posterior minus prior probability.
+    /// Posterior minus prior probability of the paying state.
     innovation: f64,
-    /// Scale of the innovation. If two cells always agree, the mean product of their innovations is the product of
-    /// their scales.
+    /// Scale of the innovation. If the states of two cells always agree, the mean product of their innovations is the
+    /// product of their scales.
     scale: f64,
 }
 
@@ -142,7 +143,8 @@ impl Evidence {
 }
 
 impl Sums {
-    /// Adds the products of a pair of seen cells, if the pair is within [`RADIUS`] columns.
+    /// Adds the products of the innovations and of the scales of two seen cells, if these are at most [`RADIUS`]
+    /// columns apart.
     fn add(&mut self, one: &Evidence, other: &Evidence) {
         let down = one.cell.row.abs_diff(other.cell.row);
         let across = one.cell.col.abs_diff(other.cell.col);
@@ -211,7 +213,7 @@ impl Correlations {
         correlations
     }
 
-    /// Learns from the evidence of one frame, whose cells are in row-major order.
+    /// Updates the correlations with the evidence of one frame, which lists the seen cells in row-major order.
     pub fn learn(&mut self, seen: &[Evidence]) {
         for (index, one) in seen.iter().enumerate() {
             let below = seen[index + 1..].iter();
@@ -258,7 +260,7 @@ impl Correlations {
     }
 }
 
-/// Returns the class of an offset from its distances in rows and columns, in any order, each at most [`RADIUS`].
+/// Returns the class of an offset, given its distances in rows and in columns in any order, each at most [`RADIUS`].
 pub const fn class(one: usize, other: usize) -> usize {
     let (less, more) = if one < other {
         (one, other)

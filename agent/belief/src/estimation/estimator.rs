@@ -10,10 +10,11 @@ use std::borrow::Cow;
 use std::error::Error as StdError;
 use thiserror::Error;
 
-/// An estimator of one world's hidden states. In each step, [`Self::correct`] applies the frame, then [`Self::predict`]
-/// moves the belief one step ahead.
+/// An estimator of one world's hidden states. In each step, [`Self::correct`] updates the belief with the frame, then
+/// [`Self::predict`] moves the belief one step ahead.
 ///
-/// Every estimator implements these two methods and [`Self::belief`]. All other methods are optional and have defaults.
+/// Every estimator implements [`Self::correct`], [`Self::predict`] and [`Self::belief`]. All other methods are optional
+/// and have defaults.
 pub trait Estimator: Send + Any {
     /// Corrects the belief with the frame of X_k (eq. 5).
     ///
@@ -21,11 +22,12 @@ pub trait Estimator: Send + Any {
     /// If the frame is impossible under the belief. The belief is then unchanged.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError>;
 
-    /// Moves the belief from X_k to X_{k+1} (eq. 6).
+    /// Predicts the belief about X_{k+1} from the belief about X_k (eq. 6).
     fn predict(&mut self);
 
-    /// Returns a function that predicts several estimators together, with the same results as [`Self::predict`] on
-    /// each. The list may contain estimators of any kind. Returns `None` if predicting together is not faster.
+    /// Returns a function that computes the predictions of several estimators together, with the same results as a call
+    /// of [`Self::predict`] on each. The list of estimators may contain any kinds. Returns `None` if this would not be
+    /// faster.
     fn predict_together(&self) -> Option<fn(Vec<&mut dyn Estimator>)> {
         None
     }
@@ -45,12 +47,13 @@ pub trait Estimator: Send + Any {
     }
 
     /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by a base filter. Only
-    /// estimators that refine the predictions of another filter have one.
+    /// estimators that refine the predictions of another filter have a base filter.
     fn base(&self) -> Option<&Probabilities> {
         None
     }
 
-    /// Returns the hidden vector `h_k` behind the belief, which is the input of a DQN (paper section III.E).
+    /// Returns the hidden vector `h_k` from which the belief is computed. It is the input of a DQN (paper section
+    /// III.E).
     fn hidden(&self) -> Option<&[f32]> {
         None
     }
@@ -60,7 +63,7 @@ pub trait Estimator: Send + Any {
         None
     }
 
-    /// Returns the interface that restores a saved state, if [`Self::handover`] can save it.
+    /// Returns the interface that restores a saved state, if the state can be saved with [`Self::handover`].
     fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
         None
     }
@@ -87,8 +90,8 @@ pub trait Handover {
 
 /// An oracle: an estimator that receives the hidden states.
 pub trait Told {
-    /// Receives hidden states, shape `[H, W]`: X_k after a frame, or X_{k+1} before a path is planned, if they are
-    /// known.
+    /// Receives the hidden states, shape `[H, W]`: X_k after each frame, and X_{k+1} before a path is planned, if
+    /// X_{k+1} is already known.
     ///
     /// # Errors
     /// If the states do not fit the belief.

@@ -1,8 +1,8 @@
 //! The Bayes filter, for known and learned parameters (paper section III.A, in the masked form of section III.C).
 //!
-//! A frame turns the predictor `u_k` into the posterior `p_k` (eq. 5); the transition turns that into the next
-//! predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the frames, so the filter is an
-//! approximation even with the true model.
+//! A frame turns the predictor `u_k` into the posterior `p_k` (eq. 5); the transition model turns the posterior into
+//! the next predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the frames, so the filter is
+//! an approximation even with the true model.
 
 use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
@@ -20,12 +20,13 @@ use std::borrow::Cow;
 #[derive(Debug, Clone)]
 pub struct BayesFilter {
     transition: Transition,
-    /// Used instead of `transition`, unless the prediction is the mean field.
+    /// The predictor to use instead of `transition`, or `None` for the mean field.
     prediction: Option<Prediction>,
     /// `P(y | x)`, shape `[S, O]`.
     likelihood: Array2<f64>,
     belief: Belief,
-    /// Buffer for the next predictor. With cavities, it also contains the belief before the next correction.
+    /// Buffer for the next predictor. With cavities, it keeps a copy of the belief between predictions, because the
+    /// next correction of the cavities needs the belief before the correction.
     predictor: Probabilities,
     /// Checksum of the parameters. A saved belief fits only a filter with the same parameters.
     checksum: u32,
@@ -162,7 +163,7 @@ impl Estimator for BayesFilter {
             + prediction.map_or(0, Prediction::memory_bytes)
     }
 
-    /// Returns the predictor `u_k`, or the posterior `p_k` after [`Estimator::correct`].
+    /// Returns the predictor `u_k` before [`Estimator::correct`], and the posterior `p_k` after it.
     fn belief(&self) -> &Belief {
         &self.belief
     }

@@ -34,8 +34,8 @@ impl Innovation {
             _ => 0.0,
         };
         let seen = usize::from(observed);
-        // If a sensor has several matrices, they are stored side by side. Average over the matrix to which this
-        // observation belongs.
+        // If a sensor has several observation matrices, `likelihood` contains them side by side. Average only over the
+        // matrix to which this observation belongs.
         let n_matrices = own[..n_observations].iter().sum::<f64>().round().max(1.0) as usize;
         let of_matrix = n_observations / n_matrices;
         let matrix = seen / of_matrix * of_matrix..(seen / of_matrix + 1) * of_matrix;

@@ -34,7 +34,7 @@ impl KeptBelief {
     /// Returns the cache file of a prior, or `None` if there is no cache folder or the belief exceeds the maximum size.
     pub fn new(prior: Prior, model: &Model, shape: Shape, seed: u64) -> Option<Self> {
         let version = env!("CARGO_PKG_VERSION");
-        // Sensors and no-fly zones do not influence the hidden states.
+        // Sensors and no-fly zones do not influence the hidden states, so the key omits them.
         let file = ModelFile {
             sensor: None,
             no_fly: None,
@@ -105,7 +105,7 @@ fn cache_folder() -> Option<PathBuf> {
 /// by a crash.
 fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let temporary = path.with_extension(std::process::id().to_string());
-    // A file left by an earlier process with the same id may have other permissions.
+    // An earlier process with the same id may have left a temporary file with other permissions.
     let _ = std::fs::remove_file(&temporary);
     let mut options = OpenOptions::new();
     options.write(true).create_new(true);
@@ -116,7 +116,7 @@ fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
         .and_then(|mut file| file.write_all(bytes))
         .and_then(|()| std::fs::rename(&temporary, path));
     if written.is_err() {
-        // Report the first error, not an error during cleanup.
+        // Return the error of the write, not an error of this cleanup.
         let _ = std::fs::remove_file(&temporary);
     }
     written
@@ -135,7 +135,7 @@ fn remove_oldest(folder: &Path, max_files: usize) {
     files.sort();
     let n_too_many = files.len().saturating_sub(max_files);
     for (_, path) in &files[..n_too_many] {
-        // Another agent may have removed the file already.
+        // Ignore errors, because another agent may have removed the file already.
         let _ = std::fs::remove_file(path);
     }
 }

@@ -12,18 +12,20 @@ use ndarray::{Array2, Array4};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Maximum magnitude of an unconstrained value. With it, weights are at least 1e-7 and probabilities at least 1e-14.
+/// Maximum magnitude of an unconstrained value. With this bound, weights are at least 1e-7 and probabilities at least
+/// 1e-14.
 pub const BOUND: f32 = 16.0;
 
-/// Initial weight of a transition in which a cell keeps its state. The initial weights suit states that persist and
-/// spread.
+/// Initial weight of a transition in which a cell keeps its state. The initial weights are chosen for states that
+/// persist and spread.
 const OWN_WEIGHT: f64 = 1.0;
 /// Initial weight of a transition in which a cell adopts a neighbour's state.
 const NEIGHBOUR_WEIGHT: f64 = 0.1;
 /// Initial weight of all other transitions, as a fraction of the two weights above.
 const OTHER_STATE: f64 = 0.005;
 
-/// Initial logit of observing a state as itself. With three observations, the probability of doing so is 0.86.
+/// Initial logit of the observation with the same index as the state. With three observations, its initial probability
+/// is 0.86.
 const OWN_OBSERVATION: f32 = 2.5;
 
 /// Amplitude of the noise on the initial logits, and of the relative noise on the initial weights. Without noise,
@@ -37,16 +39,18 @@ pub struct Dimensions {
     pub n_observations: usize,
     /// Number of rows and number of columns of the kernel, both odd.
     pub kernel: (usize, usize),
-    /// Whether there is a separate kernel for each current state of the cell, its *own state*. A checkpoint stores this
-    /// setting as the shape of a tensor.
+    /// Whether there is a separate kernel for each current state of the cell, which is called the cell's *own state*.
+    /// In a checkpoint, the shape of a tensor encodes this setting.
     #[serde(skip)]
     pub sees_own_state: bool,
-    /// Number M of observation matrices of the sensor, at least 1. A checkpoint stores it as the shape of a tensor.
+    /// Number M of observation matrices of the sensor, at least 1. In a checkpoint, the shape of a tensor encodes this
+    /// number.
     #[serde(skip, default = "one")]
     pub n_matrices: usize,
 }
 
-/// Three tensors in the order of [`Parameters::NAMES`]: unconstrained values, their gradients, or their Adam moments.
+/// Three tensors in the order of [`Parameters::NAMES`], which contain unconstrained values, the gradients of these
+/// values, or their Adam moments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
@@ -129,7 +133,7 @@ impl Dimensions {
         [kernel, likelihood, vec![states]]
     }
 
-    /// Returns the number of kernels: 1, or one per own state.
+    /// Returns the number of kernels: S with own-state kernels, otherwise 1.
     pub fn n_own(&self) -> usize {
         if self.sees_own_state {
             self.n_states
@@ -253,10 +257,10 @@ impl Tables {
         Belief::everywhere(&self.initial, shape)
     }
 
-    /// Returns the tables of a known model, which are the target of learning.
+    /// Returns the tables of a known model, which learned tables should approach.
     ///
-    /// The tables omit the bias. Beliefs sum to one, so away from the edges a bias has the same effect as a weight that
-    /// is equal for all states.
+    /// The tables omit the bias. Beliefs sum to one, so away from the edges a bias has the same effect as a neighbour's
+    /// weight that is equal for all states of the neighbour.
     ///
     /// # Panics
     /// If the model has several zones.

@@ -18,15 +18,15 @@
 //!
 //! Gauss-Laguerre quadrature with two nodes `s`, at `t = s / E[D]`, approximates the integral. The result agrees with
 //! the expansion of `1 / D` around `E[D]` to second order, and is never negative. If no `d_k` depends on the
-//! neighbour's state, `D` is certain. The mean field is then exact and is computed instead.
+//! neighbour's state, `D` is certain. The mean field is then exact, so it is computed instead of the integral.
 //!
 //! **Echo.** A cell changes its neighbours, and the changed beliefs about them change the cell's next prediction, as if
-//! they were new evidence. Dynamic message passing (Karrer and Newman 2010; Lokhov et al. 2014) avoids this. It keeps a
-//! *cavity* for each cell and each of its neighbours: the belief about the cell, given that the neighbour stays
+//! they were new evidence. Dynamic message passing (Karrer and Newman 2010; Lokhov et al. 2014) avoids this echo. It
+//! keeps a *cavity* for each cell and each of its neighbours: the belief about the cell, given that the neighbour stays
 //! susceptible. A cell is *susceptible* in the state in which its neighbours influence its next state. A susceptible
 //! cell is predicted from its neighbours' cavities, which do not contain its own influence. Cavities need own-state
-//! kernels: one kernel for each current state of the cell. If neighbours influence several of these states, the most
-//! influenced one is treated as susceptible.
+//! kernels: one kernel for each current state of the cell. If neighbours have an influence in several current states,
+//! only the state with the most influence is treated as susceptible.
 
 mod chunk;
 mod kernels;
@@ -57,12 +57,12 @@ pub enum PredictionKind {
     Cavities,
 }
 
-/// Maximum rounding error of a distribution's sum that is left uncorrected.
+/// Maximum deviation from 1 of a distribution's sum that is left uncorrected.
 const MAX_DRIFT: f32 = 1e-5;
 
 /// Normalises distributions whose rounding errors have added up, as happens in a cell that is never seen.
 ///
-/// There is one plane per state, `plane_length` apart, and one distribution per lane.
+/// The planes of two successive states start `plane_length` values apart, and each lane contains one distribution.
 #[inline(always)]
 fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
     if sums.iter().all(|sum| (sum - 1.0).abs() <= MAX_DRIFT) {
@@ -74,7 +74,7 @@ fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
     }
 }
 
-/// The predictor of one world's belief, with its cavities.
+/// The computation of one world's predictors, with the world's cavities.
 #[derive(Debug, Clone)]
 pub struct Prediction {
     shape: Shape,
@@ -83,7 +83,7 @@ pub struct Prediction {
     layout: Layout,
     /// Index of the susceptible state's kernel, if there are cavities.
     susceptible: Option<usize>,
-    /// For each neighbour, the difference between its index and the cell's index in a plane.
+    /// For each neighbour, the offset from the cell's index in a plane to the neighbour's index.
     offsets: Vec<isize>,
     beliefs: PaddedBeliefs,
     /// Buffer for the cavities after the next prediction.
@@ -94,7 +94,7 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// Prepares predictions on the belief's grid. All cavities start as the given belief.
+    /// Prepares predictions on the belief's grid. All cavities start as copies of the given belief.
     ///
     /// Without own-state kernels, [`PredictionKind::Cavities`] has no cavities and computes the second-order
     /// prediction.
@@ -153,7 +153,8 @@ impl Prediction {
         self.beliefs.n_bytes()
     }
 
-    /// Returns the cavities, each `[S, H, W]`, row-major, as little-endian `f32`. Empty without cavities.
+    /// Returns the cavities, each `[S, H, W]`, row-major, as little-endian `f32`. If there are no cavities, the result
+    /// is empty.
     pub fn to_bytes(&self) -> Vec<u8> {
         self.beliefs.cavities_to_bytes()
     }
@@ -232,7 +233,7 @@ impl Prediction {
         }
     }
 
-    /// Computes the next-state distributions of all kernels for the chunk at a place in the planes.
+    /// Computes the next-state distributions of all kernels for the chunk that starts at index `place` of a plane.
     #[inline(always)]
     fn predict_kernels(&mut self, place: usize, chunk: usize) {
         let n = self.offsets.len();
@@ -263,7 +264,7 @@ impl Prediction {
     }
 
     /// Returns the probability of a next state, averaged over the cell's current states. The belief about the current
-    /// state starts at index `at`. It is one of the cavities if `cavity` is given.
+    /// state, which is a cavity if `cavity` is given, starts at index `at`.
     #[inline(always)]
     fn next_probability(
         &self,

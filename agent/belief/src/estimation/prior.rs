@@ -21,7 +21,7 @@ pub enum Prior {
     /// the first frame.
     Simulated {
         n_worlds: usize,
-        /// Number of steps from the initial distribution.
+        /// Number of simulated steps, starting from the initial distribution.
         burn_in: u64,
     },
     /// The model's initial distribution, which is exact for a world without burn-in.
@@ -43,8 +43,8 @@ impl Prior {
         Ok(belief.expect("invariant: nothing cancels it"))
     }
 
-    /// Returns the belief as [`Self::belief`] does, or `None` soon after `cancelled` is set. A simulation can take
-    /// minutes.
+    /// Returns the belief as [`Self::belief`] does, but stops early and returns `None` if `cancelled` is set, because a
+    /// simulation can take minutes.
     pub fn belief_unless(
         self,
         cancelled: &AtomicBool,
@@ -74,16 +74,17 @@ impl Prior {
 /// A simulation of several worlds in parallel.
 struct Simulation<'a> {
     dynamics: Dynamics,
-    /// S, H and W.
+    /// The numbers of states, rows and columns: S, H and W.
     dim: (usize, usize, usize),
     seed: u64,
-    /// Number of steps from the initial distribution.
+    /// Number of simulated steps, starting from the initial distribution.
     burn_in: u64,
     cancelled: &'a AtomicBool,
 }
 
 impl Simulation<'_> {
-    /// Counts the worlds in which each cell is in each state, shape `[S, H, W]`. Once cancelled, worlds stop early.
+    /// Counts the worlds in which each cell is in each state, shape `[S, H, W]`. After a cancellation, the simulations
+    /// of the worlds stop early.
     ///
     /// Counts are integers, so the order in which threads add them does not matter.
     fn counts(&self, n_worlds: usize) -> Array3<u32> {
@@ -123,7 +124,7 @@ fn average(counts: &Array3<u32>, n_states: usize, shape: Shape) -> Belief {
         .map(|state| f64::from(in_all(state)))
         .collect();
     let total: f64 = totals.iter().sum();
-    // Add-one smoothing, so that a state that was never simulated keeps a positive probability.
+    // Add-one smoothing, so that a state that never occurred in the simulations keeps a positive probability.
     let pooled = |state: usize| (totals[state] + 1.0) / (total + n_states as f64);
     let n_worlds = total / shape.n_cells() as f64;
     let probability = |(state, row, col): (usize, usize, usize)| {
@@ -176,7 +177,7 @@ mod tests {
             .belief(&Model::wildfire(), shape, 0)
             .expect("valid model");
         let mean = prior.probability(1).mean().expect("not empty");
-        // Each of 25,600 cells is latent with probability .01: four standard errors are .0025.
+        // Each of 25,600 cells is latent with probability .01, so four standard errors of the mean are .0025.
         assert!((mean - 0.01).abs() < 0.0025, "{mean}");
         assert!(prior.view().iter().all(|&p| p > 0.0));
     }

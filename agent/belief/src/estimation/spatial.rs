@@ -1,9 +1,9 @@
 //! A Bayes filter whose corrections reach the neighbours of visited cells.
 //!
 //! The filter of eqs. 5 and 6 assumes that cells are independent given the frames, and corrects visited cells only. But
-//! states are strongly correlated in space. This filter spreads the innovation of each visited cell to its
-//! neighbourhood by optimal interpolation (Gandin 1963), with learned [`Correlations`]. The prediction is still eq. 6,
-//! and no covariances are kept between steps.
+//! the states of nearby cells are strongly correlated. This filter spreads the innovation of each visited cell to its
+//! neighbourhood by optimal interpolation (Gandin 1963), with learned [`Correlations`]. The prediction step is still
+//! eq. 6, and no covariances are kept between steps.
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::Belief;
@@ -26,7 +26,7 @@ const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::c
 #[derive(Debug, Clone)]
 pub struct SpatialFilter {
     filter: BayesFilter,
-    /// The state whose probability corrections spread to neighbours.
+    /// The state for which corrections are spread to neighbours.
     state: usize,
     correlations: Correlations,
     ages: Ages,
@@ -45,13 +45,14 @@ pub fn correcting(
 }
 
 impl SpatialFilter {
-    /// Returns the [`Handover::kind`] of spatial filters. `filter` is the kind of the wrapped filter, and `state` the
-    /// state whose probability is spread.
+    /// Returns the [`Handover::kind`] of spatial filters. `filter` is the kind of the wrapped filter, and `state` is
+    /// the state for which corrections are spread to neighbours.
     pub fn handover_of(filter: &str, state: usize) -> String {
         format!("spatial {filter}, ages and sums of state {state} as bincode")
     }
 
-    /// Wraps a filter. Corrections spread the probability of `state`, the *paying state* with the highest reward.
+    /// Wraps a filter. Corrections to the probability of `state` (the *paying state*, which has the highest reward) are
+    /// spread to neighbours.
     ///
     /// Each frame updates `correlations`. The default correlations are zero.
     ///
@@ -129,7 +130,7 @@ impl Estimator for SpatialFilter {
     }
 
     fn memory_bytes(&self) -> usize {
-        // `Ages` and `Spread` keep 10 bytes per cell.
+        // `Ages` and `Spread` together use 10 bytes per cell.
         self.filter.memory_bytes() + size_of::<Self>() + 10 * self.ages.as_slice().len()
     }
 

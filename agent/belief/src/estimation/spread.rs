@@ -6,8 +6,8 @@ use crate::estimation::innovation::Innovation;
 use emberwatch_model::vectors::vectorised;
 use emberwatch_model::{Cell, Shape};
 
-/// Bound on spread probabilities. An observation of a neighbour is never conclusive, so it keeps the probability of the
-/// paying state between `LEAST` and `1 - LEAST`.
+/// Bound on probabilities that are corrected by a neighbour's observation. Such an observation is never conclusive, so
+/// the probability of the paying state stays between `LEAST` and `1 - LEAST`.
 const LEAST: f32 = 1e-5;
 
 /// Index of the seen cell in its own patch.
@@ -28,8 +28,8 @@ const CLASSES: [[usize; SIDE]; SIDE] = {
 /// Length of a row of a [`Patch`]: the side of a neighbourhood, and a margin at either end.
 const WIDTH: usize = SIDE + 2 * RADIUS;
 
-/// Covariances of a seen cell with each cell of its neighbourhood, row-major. Margins make it possible to align the
-/// patches of two nearby cells by a single offset.
+/// Covariances of a seen cell with each cell of its neighbourhood, row-major. Each row has margins, so that a single
+/// offset aligns the patches of two nearby cells.
 type Patch = [f32; WIDTH * SIDE];
 
 /// Work space of a correction. Per-cell buffers are row-major, with a margin of [`RADIUS`] cells around the grid. The
@@ -37,12 +37,12 @@ type Patch = [f32; WIDTH * SIDE];
 #[derive(Debug, Clone)]
 pub struct Spread {
     shape: Shape,
-    /// The state whose probability corrections spread to neighbours.
+    /// The state for which corrections are spread to neighbours.
     state: usize,
     /// Length of a row with its margins.
     stride: usize,
     probability: Vec<f32>,
-    /// Standard deviation of the paying state before the frame.
+    /// For each cell, the standard deviation of "the cell is in the paying state" (1 or 0) before the frame.
     deviation: Vec<f32>,
     ages: Vec<u8>,
     seen: Vec<SeenCell>,
@@ -173,7 +173,7 @@ impl Spread {
         let gain = (innovation.value / innovation.variance) as f32;
         let own_variance = patch[CENTRE];
         for (offset, row) in patch.chunks_exact_mut(WIDTH).enumerate() {
-            // The margins hold stale values and match no cell.
+            // The margins contain stale values that belong to no cell.
             row[..RADIUS].fill(0.0);
             row[RADIUS + SIDE..].fill(0.0);
             let start = corner + offset * self.stride;

@@ -7,7 +7,7 @@ use emberwatch_model::{Frame, Grid, Model, Probabilities, Transition};
 
 /// An oracle that receives X_k, the states that the frame observed.
 ///
-/// Its belief is certain of these states, until [`Estimator::predict`] moves it one step ahead for the next path.
+/// Its belief gives these states probability 1, until [`Estimator::predict`] moves it one step ahead for the next path.
 pub struct Oracle {
     belief: Belief,
     transition: Transition,

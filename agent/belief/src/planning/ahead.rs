@@ -45,9 +45,9 @@ impl Planner for Ahead {
     }
 }
 
-/// Computes for each cell the maximum of all cells' values, discounted by their distance, shape `[H, W]`. Each move on
-/// the way to a cell multiplies its value by `kept_per_move`. This guides the search in regions where all values are
-/// equal.
+/// Computes for each cell the maximum of the values of all cells, discounted by distance, shape `[H, W]`: each move on
+/// the way to another cell multiplies that cell's value by `kept_per_move`. This guides the search in regions where all
+/// values are equal.
 fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
     let mut promise = values.worth().mapv(|value| value.max(0.0));
     let airspace = values.airspace();

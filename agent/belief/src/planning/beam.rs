@@ -1,9 +1,9 @@
-//! Beam search over paths. It keeps the best B partial paths at each move.
+//! Beam search over paths, which keeps the best B partial paths at each move.
 //!
-//! The planner of paper section III.D draws paths at random. But the objective of eq. 15 over distinct cells is an
-//! orienteering problem, for which extending only good partial paths finds far better paths in less time. A state of
-//! the search consists of the robot's cell and the set of cells visited so far. Of the partial paths with the same
-//! state, the search keeps the best.
+//! The planner of paper section III.D draws paths at random. But if eq. 15 counts only distinct cells, its maximisation
+//! is an orienteering problem. For such a problem, extending only good partial paths finds far better paths in less
+//! time. A state of the search consists of the robot's cell and the set of cells visited so far. Of the partial paths
+//! with the same state, the search keeps the best.
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use crate::planning::reach::Reach;
@@ -15,9 +15,9 @@ const HASH_KEY: u64 = 0x6265_616d;
 
 /// The default width.
 ///
-/// With the known-model filter, width 100 earned 37.2 +- 2.2 per step on 40 training worlds of 300 steps. Widths 50 and
-/// 200 earned .5 +- .9 and .5 +- .8 less (paired differences), and took 0.4 and 2 times as long. A greedy walk earned
-/// 8.1 +- .8 less (16 worlds).
+/// With the known-model filter, width 100 earned a reward of 37.2 +- 2.2 per step on 40 training worlds of 300 steps.
+/// Widths 50 and 200 earned .5 +- .9 and .5 +- .8 less (paired differences), and took 0.4 and 2 times as long. A greedy
+/// walk earned 8.1 +- .8 less (16 worlds).
 pub const DEFAULT_WIDTH: usize = 50;
 
 /// Beam search of a given width. A hash of the visited cells breaks ties, so that no direction is preferred.
@@ -38,8 +38,8 @@ pub struct BeamSearch {
     /// For each state of the beam, one bit per cell of the reach: whether the path has visited it.
     visited: Vec<u64>,
     next_visited: Vec<u64>,
-    /// If cells in sight count: for each state of the beam, one bit per cell in sight of the reach, set if the path has
-    /// seen the cell.
+    /// For each state of the beam, one bit per cell in sight of the reach: whether the path has seen it. Empty unless
+    /// cells in sight count.
     seen_cells: Vec<u64>,
     next_seen_cells: Vec<u64>,
     candidates: Vec<Candidate>,
@@ -67,7 +67,7 @@ struct Candidate {
     origin: Origin,
 }
 
-/// The index of the previous state, and the move from it.
+/// The origin of a state in the beam: the index of the previous state, and the move from there.
 #[derive(Debug, Clone, Copy)]
 struct Origin {
     state: u32,
@@ -116,7 +116,7 @@ impl BeamSearch {
         self.cell_hashes.clear();
     }
 
-    /// Sets the discount: the cell of each move counts `discount` times as much as that of the previous move. The
+    /// Sets the discount: the cell of each move counts `discount` times as much as the cell of the previous move. The
     /// default is 1.
     pub fn set_discount(&mut self, discount: f32) {
         self.discount = discount;
@@ -324,10 +324,10 @@ impl Planner for BeamSearch {
     }
 }
 
-/// Returns bits that sort as unsigned integers in the same order as the scores.
+/// Converts a score to bits that, as unsigned integers, sort in the same order as the scores.
 fn ordered_bits(score: f32) -> u32 {
     let bits = score.to_bits();
-    // As bits, negative numbers are in reverse order, and above the positive ones.
+    // The bits of negative scores sort in reverse order, and above the bits of positive scores.
     bits ^ if bits >> 31 == 1 { u32::MAX } else { 1 << 31 }
 }
 
@@ -341,7 +341,7 @@ struct SeenStates {
 }
 
 impl SeenStates {
-    /// Creates a table for `n` states, which is then at most half full, so that probes are short.
+    /// Creates a table for `n` states. They fill at most half of the table, so that probe sequences are short.
     fn new(n: usize) -> Self {
         let slots = vec![(0, 0, 0); (2 * n).next_power_of_two()];
         Self { slots, round: 0 }

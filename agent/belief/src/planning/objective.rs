@@ -1,5 +1,5 @@
-//! The goal of a path. An [`Objective`] and a belief determine [`CellValues`], which planners maximise. These values
-//! are the costs `c_1` and `c_2` of paper eqs. 13 and 14 with the opposite sign.
+//! Objectives, the goals of planned paths. An [`Objective`] and a belief determine [`CellValues`], which planners
+//! maximise. These values are the costs `c_1` and `c_2` of paper eqs. 13 and 14 with the opposite sign.
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use emberwatch_model::grid::{Cell, Grid, Shape};
@@ -11,8 +11,9 @@ use serde::{Deserialize, Serialize};
 /// Bonus of beam search for each distinct cell, in addition to its probability.
 ///
 /// The bonus is just large enough to make a robot leave a region without value. Without it, a clairvoyant robot stays
-/// where nothing burns, and earns 20.2 +- 8.1 instead of 43.6 +- 6.5 per step. With the filter, the bonus makes no
-/// difference (36.4 and 36.6). Both were measured on 8 training worlds with burn-in 25,000 over 1,500 steps.
+/// where nothing burns, and earns a reward of 20.2 +- 8.1 instead of 43.6 +- 6.5 per step. With the filter, the bonus
+/// makes no difference (36.4 and 36.6). All rewards were measured on 8 training worlds with burn-in 25,000 over 1,500
+/// steps.
 pub const BEAM_BONUS: f32 = 0.02;
 
 /// The belief on which paths are planned.
@@ -28,11 +29,11 @@ pub enum BasisKind {
 /// The quantity that a path collects at its cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Target {
-    /// The probability of one state: the paper's actions `a_k < S`.
+    /// The probability of one state, which is an action `a_k < S` of the paper.
     State(usize),
-    /// The entropy of the belief: the paper's action `a_k = S`.
+    /// The entropy of the belief, which is the action `a_k = S` of the paper.
     Entropy,
-    /// The visit itself, regardless of the belief.
+    /// Nothing but the bonus per distinct cell, regardless of the belief.
     Coverage,
 }
 
@@ -61,15 +62,15 @@ pub struct Objective {
     pub revisits: bool,
 }
 
-/// The value of each cell of the grid to a planner. All values are finite.
+/// The value that a planner assigns to each cell of the grid. All values are finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellValues {
     /// The value of a cell on the path.
     value: Grid<f32>,
     coverage_bonus: f32,
     revisits: bool,
-    /// The value of each cell in sight of the path. `None` if only cells on the path count or the sensor sees only
-    /// these.
+    /// The value of each cell in sight of the path. `None` if only cells on the path count, or if the sensor sees no
+    /// other cells.
     in_sight: Option<Grid<f32>>,
     airspace: Airspace,
 }
@@ -141,8 +142,8 @@ impl CellValues {
         }
     }
 
-    /// Applies the no-fly cells and the sensor of an airspace. `in_sight` contains an additional finite value for each
-    /// distinct cell in sight of the path, shape `[H, W]`.
+    /// Applies the no-fly cells and the sensor of an airspace. `in_sight` contains the finite value that each cell adds
+    /// once if it is in sight of the path, shape `[H, W]`.
     ///
     /// # Panics
     /// If the airspace has a different grid.
@@ -217,8 +218,8 @@ impl CellValues {
     /// Returns the values that remain after a teammate's path: cells that the teammate visits or sees are worth
     /// nothing.
     ///
-    /// `visited` lists the row-major indices of the teammate's cells, and may repeat them. With revisits, cells on the
-    /// path keep their value.
+    /// `visited` lists the row-major indices of the teammate's cells, and may repeat them. If revisits count, cells on
+    /// the teammate's path keep their value.
     pub fn without(&self, visited: &[usize]) -> Self {
         let mut left = self.clone();
         if !left.revisits {

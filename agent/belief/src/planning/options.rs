@@ -21,7 +21,7 @@ pub struct PathOption {
     worth: [f32; 4],
     /// Number of consecutive paths in the plan, at least 1. The robot flies only the first.
     n_paths: usize,
-    /// The layer whose best region attracts the path.
+    /// The layer that determines the goal: the path is attracted to the region where the layer's sum is best.
     goal: Option<Layer>,
 }
 
@@ -75,11 +75,11 @@ pub const OPTIONS: [PathOption; 8] = [
 /// Number of features of an option: see [`feature_names`].
 pub const N_FEATURES: usize = 18 + OPTIONS.len();
 
-/// Increase of a cell's value for each cell that it is closer to the goal. It outweighs the values of cells away from
-/// the direct path.
+/// Increase of the cells' values for each row or column closer to the goal. It outweighs the values of cells off the
+/// direct path.
 const SLOPE: f32 = 0.3;
 
-/// Distance from the goal, in rows and in columns, within which the value does not increase.
+/// Distance from the goal, in rows and in columns, within which the values do not increase any further.
 const GOAL_RADIUS: usize = 2;
 
 /// Discount of a region's sum for each path that the robot needs to reach the region.
@@ -303,8 +303,8 @@ pub fn feature_names() -> Vec<String> {
         .collect()
 }
 
-/// Chooses an option by a hand-written rule: the best region if its discounted surplus exceeds the surplus around the
-/// robot, otherwise `exploit`.
+/// Chooses an option by a hand-written rule: to fly to the best region if its discounted surplus exceeds the surplus
+/// around the robot, otherwise `exploit`.
 pub fn choose_by_rule(outlook: &Outlook, robot: Cell) -> &'static PathOption {
     let goal = outlook.best_region(Layer::Surplus, robot, KEPT_PER_PATH);
     let n_paths = distance(robot, goal) as f32 / outlook.n_moves as f32;

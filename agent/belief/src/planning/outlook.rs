@@ -20,11 +20,11 @@ const LIKELY: f32 = 0.3;
 pub enum Layer {
     /// Probability of the state with the highest reward.
     Probability,
-    /// Excess of this probability over 0.3, or 0 if it is lower.
+    /// Amount by which the probability of the state with the highest reward exceeds 0.3, or 0 if it does not.
     Surplus,
     /// Entropy of the belief, as a fraction of the maximum `log S`.
     Entropy,
-    /// [`Memory::novelty`].
+    /// The novelty of the cell (see [`Memory::novelty`]).
     Novelty,
 }
 
@@ -89,7 +89,7 @@ impl Outlook {
         outlook.without_visits(&closed.map(|(cell, _)| cell).collect::<Vec<_>>())
     }
 
-    /// Sets layers to 0 in visited cells, except the layers that count in sight.
+    /// Sets layers to 0 in visited cells, except the layers that count in all cells in sight.
     fn without_visits(mut self, visited: &[usize]) -> Self {
         for layer in Layer::ALL {
             if !self.counts_in_sight(layer) {
@@ -102,8 +102,8 @@ impl Outlook {
         self
     }
 
-    /// Sets layers to 0 in the cells that another robot visits. Layers that count in sight are also set to 0 in the
-    /// cells that it sees.
+    /// Sets layers to 0 in the cells that another robot visits. Layers that count in all cells in sight are also set to
+    /// 0 in the cells that the other robot sees.
     pub fn without(mut self, visited: &[usize]) -> Self {
         let seen = self.airspace.see(visited);
         for layer in Layer::ALL {
@@ -161,9 +161,9 @@ impl Outlook {
         along(height).flat_map(move |row| along(width).map(move |col| Cell { row, col }))
     }
 
-    /// Returns the centre of the region with the highest discounted sum of a layer, among those more than half a path
-    /// away. Each path on the way there multiplies the sum by `kept_per_path`. If all sums are 0, returns the robot's
-    /// cell.
+    /// Returns the centre of the region with the highest discounted sum of a layer, among regions more than half a path
+    /// away. The sum is multiplied by `kept_per_path` for each path on the way to the region. If all sums are 0,
+    /// returns the robot's cell.
     pub fn best_region(&self, layer: Layer, robot: Cell, kept_per_path: f32) -> Cell {
         let mut best = (0.0, robot);
         for centre in self.centres() {

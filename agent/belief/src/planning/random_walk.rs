@@ -1,11 +1,12 @@
-//! The random walk: the paper's baseline, and the path of its sections III.B and III.C.
+//! The random walk, which is the paper's baseline and the robot's path in sections III.B and III.C.
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use emberwatch_model::path::Move;
 use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 
-/// A planner that draws moves uniformly and independently, regardless of the cells' values. It avoids no-fly cells.
+/// A planner that draws moves uniformly and independently, regardless of the cells' values. The planner avoids no-fly
+/// cells.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RandomWalk;
 

@@ -6,7 +6,7 @@ use emberwatch_model::grid::Cell;
 use emberwatch_model::path::Move;
 use std::ops::Range;
 
-/// The rectangle of cells within T rows and T columns of the start, and their values.
+/// The rectangle of cells within T rows and T columns of the start of a path of T moves, and the values of these cells.
 ///
 /// No path of T moves crosses a border of the reach that lies inside the grid. Clamping moves to the reach therefore
 /// has the same effect as clamping them to the grid.
@@ -87,7 +87,7 @@ impl Reach {
         row as usize * self.cols + col as usize
     }
 
-    /// Returns the cell after a move. A move off the reach leaves the robot in place, as [`Move::apply`] does on the
+    /// Returns the cell after a move. A move out of the reach leaves the robot in place, as [`Move::apply`] does on the
     /// grid.
     #[inline]
     pub fn after(&self, step: Move, row: u32, col: u32) -> (u32, u32) {

@@ -17,7 +17,7 @@ const MOVES_PER_WORD: usize = 32;
 /// Number of samples whose positions are computed in parallel: two SSE registers of `i16`.
 const LANES: usize = 16;
 
-/// Change in row and column for each [`Move`], in the order of their wire values.
+/// Change in row and column for each [`Move`], in the order of the moves' wire values.
 const OFFSETS: [(i32, i32); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
 
 /// The rule that converts a sample's moves to cells.
@@ -28,8 +28,8 @@ pub enum Integration {
     #[default]
     ClampEachMove,
     /// The moves are summed without regard to the grid, and each partial sum is clamped, as in the authors' code. A
-    /// sample that leaves the grid by five cells stays at the border until it has returned by five. The robot visits
-    /// the same cells by moving against the border.
+    /// sample whose sum is five cells beyond the border stays at the border until five moves back. The robot visits the
+    /// same cells by moving against the border.
     ClampSum,
 }
 
@@ -47,7 +47,7 @@ pub struct Shooting {
     cells: Vec<[(i16, i16); LANES]>,
 }
 
-/// A cell of the reach. All data that a visit reads or writes is in one place.
+/// A cell of the reach, with all data that the scoring of a visit reads or writes.
 #[derive(Debug, Clone, Copy)]
 struct Slot {
     /// The gains of the first and of a later visit, as in [`Reach::gains`].
@@ -193,8 +193,8 @@ impl Shooting {
     }
 }
 
-/// Plans by random shooting if there are no-fly cells, or if cells in sight count. It replaces moves into no-fly cells,
-/// clamps each move, and scores one path at a time.
+/// Plans by random shooting if there are no-fly cells, or if cells in sight count. The function replaces moves into
+/// no-fly cells, clamps each move, and scores one path at a time.
 fn best_of_flown(problem: &PlanningProblem<'_>, n_samples: usize) -> Plan {
     let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
     let n_words = problem.n_moves.div_ceil(MOVES_PER_WORD);

@@ -1,4 +1,4 @@
-//! A joint plan for several robots. A cell that one of them visits is worth nothing to its teammates.
+//! A joint plan for several robots. A cell that one robot visits is worth nothing to its teammates.
 //!
 //! The robots plan one after the other, each on the values that remain after its teammates' paths. Then each robot
 //! plans again, given all other paths (best response), and keeps the better of its two paths. The team's value
@@ -12,8 +12,8 @@ use emberwatch_model::randomness::split_mix;
 /// Default number of best-response rounds.
 pub const ROUNDS: usize = 2;
 
-/// Plans a path for each robot. A plan's score counts only cells that no teammate's path visited at the time of
-/// planning.
+/// Plans a path for each robot. The score of each plan counts only cells that no teammate's path visited when the plan
+/// was made.
 ///
 /// `seed` and `step` select the planner's random numbers. Each round omits the robot that planned last, because it
 /// already knew all other paths. A single robot therefore plans only once, whatever `rounds` is.
@@ -30,7 +30,7 @@ pub fn plan_team(
     let mut visited: Vec<Vec<usize>> = Vec::with_capacity(n_robots);
     let mut n_unchanged = 0;
     for turn in 0..n_robots + rounds * n_robots.saturating_sub(1) {
-        // Stop when no robot can improve.
+        // Stop when no robot can improve its path.
         if turn >= n_robots && n_unchanged + 1 >= n_robots {
             break;
         }

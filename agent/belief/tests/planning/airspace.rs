@@ -23,8 +23,8 @@ fn airspace(key: u64, shape: Shape, start: Cell, radius: usize, pays: Pays) -> A
     Airspace::new(shape, Some(Arc::new(map)), radius, 1, pays)
 }
 
-/// Computes the score of the robots' paths from the set of their cells, each of which counts once. With revisits, each
-/// visit counts.
+/// Computes the score of the robots' paths from the set of their cells, each of which counts once. If revisits count,
+/// each visit counts instead.
 fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]]) -> f32 {
     let shape = air.shape();
     let value = |at: (usize, usize)| match objective.target {

@@ -58,7 +58,7 @@ proptest! {
 
     #[test]
     fn shooting_finds_the_first_of_its_best_samples(field in fields(8, 70, 1)) {
-        // Coverage scores are whole numbers, which have no rounding errors and many ties.
+        // Coverage scores are whole numbers, so there are no rounding errors, but many ties.
         let values = Objective::new(Target::Coverage).values(&field.belief);
         let (problem, shape) = (field.problem(&values), values.shape());
         for integration in [Integration::ClampEachMove, Integration::ClampSum] {

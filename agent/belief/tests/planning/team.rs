@@ -99,7 +99,7 @@ fn two_robots_gain_nearly_what_the_best_pair_of_paths_gains() {
             let optimum = pairs.map(|(a, b)| team.worth_of(&[a, b]));
             let (worth, optimum) = (plan(ROUNDS), optimum.fold(0.0, f64::max));
             assert!(worth <= optimum + ROUNDING, "{worth} above {optimum}");
-            // The guarantee for a greedy team (Fisher, Nemhauser and Wolsey, 1978).
+            // A greedy team reaches at least half of the optimum (Fisher, Nemhauser and Wolsey, 1978).
             assert!(worth >= optimum / 2.0 - ROUNDING, "{worth} of {optimum}");
             n_best += usize::from(worth >= optimum - ROUNDING);
             n_all += 1;

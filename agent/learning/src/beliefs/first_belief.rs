@@ -7,7 +7,7 @@ use emberwatch_belief::estimation::prior::Prior;
 use emberwatch_model::ModelError;
 use emberwatch_model::{Model, Shape};
 
-/// Simulated cell steps per second per core: 64 x 64 cells of the wildfire take 3.4 us.
+/// Number of cell updates that one core simulates per second: one step of 64 x 64 cells of the wildfire takes 3.4 us.
 const CELLS_PER_SECOND: f64 = 1.2e9;
 
 /// Returns the belief before the first frame, from the cache if possible. See [`Prior::belief`].

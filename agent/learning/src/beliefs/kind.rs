@@ -23,7 +23,8 @@ pub struct BeliefKind {
     pub learned_by: Option<LearnedBy>,
     /// Legend text and colour (red, green, blue) of its policies in charts.
     pub chart: (&'static str, [u8; 3]),
-    /// Returns the name of the format in which agents hand over this belief. Only for kinds that know the model.
+    /// Returns the name of the format in which an agent hands this belief over to a robot's next agent. Set only for
+    /// kinds that know the model.
     pub handover: Option<fn(&Model) -> String>,
     /// Builds an estimator before its first frame.
     pub build: fn(&Conditions<'_>) -> Result<Box<dyn Estimator>>,

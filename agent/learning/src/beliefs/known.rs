@@ -72,7 +72,7 @@ fn spatial(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<SpatialF
     Ok(SpatialFilter::new(filter, state, Correlations::default()))
 }
 
-/// Returns the name of the handover format of a spatial filter, see `Handover::kind`.
+/// Returns the name of the format in which an agent hands over a spatial filter, see `Handover::kind`.
 fn spatial_handover(model: &Model, kind: PredictionKind) -> String {
     SpatialFilter::handover_of(
         &BayesFilter::handover_of_known(model, kind),

@@ -355,7 +355,7 @@ impl Handover for NeuralEstimator {
     }
 }
 
-/// Runs the predictions of several estimators. Worlds with the same network and grid share one pass.
+/// Runs the predictions of several estimators. Worlds with the same network and grid share one forward pass.
 fn predict_together(estimators: Vec<&mut dyn Estimator>) {
     let (mut networks, mut others) = (Vec::<&mut NeuralEstimator>::new(), Vec::new());
     for estimator in estimators {
@@ -375,7 +375,7 @@ fn predict_together(estimators: Vec<&mut dyn Estimator>) {
 }
 
 impl NeuralEstimator {
-    /// Advances the sightings and the corrected filter by one step.
+    /// Adds one step to the ages of all sightings, and predicts the corrected filter one step ahead.
     fn advance(&mut self) {
         self.sightings.pass();
         if let Some(filter) = &mut self.filter {
@@ -384,8 +384,8 @@ impl NeuralEstimator {
         }
     }
 
-    /// Returns the key by which worlds are grouped into passes: the network, the grid, and whether the network corrects
-    /// a filter.
+    /// Returns the key by which worlds are grouped into forward passes: the network, the grid, and whether the network
+    /// corrects a filter.
     fn pass_key(&self) -> (usize, [usize; 2], bool) {
         let (height, width) = self.sightings.shape().dim();
         (self.network.id(), [height, width], self.base.is_some())

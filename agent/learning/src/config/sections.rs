@@ -189,7 +189,8 @@ impl LearningConfig {
         check("learning.", &ranges)
     }
 
-    /// Returns the factor on the step size at an update: first 1, then falling linearly to `final_rate`.
+    /// Returns the factor that the step size is multiplied by at an update. It is 1 at first, then falls linearly to
+    /// `final_rate`.
     pub fn rate_at(&self, update: u64) -> f64 {
         let fallen = update.saturating_sub(self.steady_updates) as f64;
         let share = 1.0 - fallen / self.falling_updates.max(1) as f64;

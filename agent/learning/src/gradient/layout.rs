@@ -1,11 +1,13 @@
-//! The memory layout of one plane per state. Margins of zeros allow kernels to treat all cells alike.
+//! A memory layout with one plane per state. Margins of zeros allow kernels to treat cells at the border like all other
+//! cells.
 
 use emberwatch_model::Shape;
 
 /// Number of cells in the widest SIMD vector, which is a multiple of every processor's vector length.
 pub(super) const LANES: usize = 16;
 
-/// Planes with margins of half a kernel. Rows are padded to a multiple of [`LANES`], plus [`LANES`] further columns.
+/// The layout of planes whose margins are half a kernel wide. Rows are padded to a multiple of [`LANES`], plus
+/// [`LANES`] further columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
     pub(super) shape: Shape,

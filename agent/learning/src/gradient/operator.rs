@@ -253,7 +253,7 @@ impl Operator {
     }
 }
 
-/// Returns two values for each own state and next state: the index of the centre weight for the own state, and the
+/// For each own state and next state, returns the index of the centre weight that applies to the own state, and the
 /// indices of the centre weights for all states.
 fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
     let (n_states, n_taps) = (layout.n_states, layout.n_taps());

@@ -31,7 +31,7 @@ pub struct Optimiser {
     seed: u64,
     pub shape: Shape,
     pub(crate) streams: Vec<Stream>,
-    /// Remaining blocks of this lap, which is one pass through all blocks in random order.
+    /// Blocks that remain in this lap. A lap is one pass through all blocks in random order.
     lap: Vec<u64>,
     n_laps: u64,
     #[serde(skip)]
@@ -155,7 +155,7 @@ impl Optimiser {
         self.place_streams(replay);
         let outcomes = self.run_windows(replay);
         let (log_likelihood, n_seen, mut gradient) = add_up(&outcomes, self.dimensions());
-        // Checked here, before a belief with such values is stored in the replay buffer.
+        // Checked before `move_streams`, which would store a belief with such values in the replay buffer.
         if !log_likelihood.is_finite() {
             return Err(self.wrong("loss", "a NaN or infinite sum"));
         }
@@ -203,7 +203,8 @@ impl Optimiser {
         block.frames.len().div_ceil(self.config.window)
     }
 
-    /// Returns the next block of the lap. Starts a new lap through all blocks if the lap has ended.
+    /// Returns the next block of the current pass through all blocks. If the pass is complete, starts another in a new
+    /// random order.
     fn next_block<'a>(&mut self, replay: &'a BlockReplay) -> (u64, &'a Block) {
         loop {
             match self.lap.pop() {

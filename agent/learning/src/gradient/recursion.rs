@@ -1,7 +1,7 @@
 //! The filter's recursion through one window of frames, and its derivatives by backpropagation.
 //!
 //! For each frame, the forward pass computes `p = B(y) u / (b(y)' u)` on visited cells (paper eq. 5), then
-//! `u = Phi_w(p)` (eq. 6). Its value is the log-likelihood, the sum of `ln b(y)' u` over visited cells. The backward
+//! `u = Phi_w(p)` (eq. 6). The result is the log-likelihood, the sum of `ln b(y)' u` over visited cells. The backward
 //! pass runs the same steps in reverse, and stops at the window's first predictor (truncated backpropagation).
 //! Gradients are zero far from the cells that later frames visit, so only the remaining region is computed.
 
@@ -184,8 +184,8 @@ impl Recursion {
         }
     }
 
-    /// Backpropagates through eqs. 2 and 3, from `dL/du` of a frame to `dL/dp` of the previous one. Returns the region
-    /// of `dL/dp`.
+    /// Backpropagates through eqs. 2 and 3, from `dL/du` of a frame to `dL/dp` of the previous frame. Returns the
+    /// region of `dL/dp`.
     #[inline(always)]
     fn unpredict<S: Simd>(
         &mut self,

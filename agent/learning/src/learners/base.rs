@@ -23,7 +23,8 @@ pub struct LearnerKind {
     pub name: &'static str,
     /// Short description of the result.
     pub about: &'static str,
-    /// Names of its kind of checkpoint: the name that it writes, followed by names from earlier releases.
+    /// Names of the learner's kind of checkpoint: the name that new files contain, followed by names from earlier
+    /// releases.
     pub checkpoints: &'static [&'static str],
     /// Names of the values that its updates report besides loss and step size.
     pub columns: &'static [&'static str],
@@ -35,7 +36,7 @@ pub struct LearnerKind {
     pub episode_steps: fn(&AgentConfig) -> Option<u64>,
     /// Returns the number of world steps that the learner of a checkpoint has learned from.
     pub done: fn(&Contents) -> Result<u64>,
-    /// Copies the settings that a checkpoint determines to the settings of a run that resumes it.
+    /// When a run resumes a checkpoint, copies the settings that the checkpoint determines into the run's settings.
     pub adopt: fn(&Contents, &mut AgentConfig),
     /// Loads from a checkpoint the values that policies use. Returns whether it replaced a different value.
     pub read: fn(&Contents, &Device, &mut Learned) -> Result<bool>,
@@ -108,7 +109,8 @@ impl Worlds {
         Ok(())
     }
 
-    /// Creates a rollout before its first correction. `target` is the index of the state with the highest reward.
+    /// Creates a rollout whose belief has not been corrected yet. `target` is the index of the state with the highest
+    /// reward.
     pub(super) fn rollout(
         &self,
         config: &AgentConfig,

@@ -68,10 +68,10 @@ pub struct DecisionsLearner {
     policy: Policy,
     dqn: Dqn,
     runs: Vec<Run>,
-    /// The saved run of each world, until the learner is attached.
+    /// The saved run of each world, kept until the learner is attached to its robots.
     saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
-    /// Updates that are due but not made yet.
+    /// Number of updates that are due but not made yet.
     earned: f64,
     is_frozen: bool,
 }
@@ -102,7 +102,7 @@ impl DecisionsLearner {
         Ok(learner)
     }
 
-    /// Creates a rollout before its first correction.
+    /// Creates a rollout whose belief has not been corrected yet.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
         let (base, names) = (&self.base, self.base.state_names.clone());
         let (config, policy) = (&self.config, (&self.policy, self.base.target));
@@ -110,7 +110,7 @@ impl DecisionsLearner {
         Ok(worlds.rollout(config, policy, estimator, names, observation))
     }
 
-    /// Creates a run from the first observation of an episode.
+    /// Begins a robot's run with the first observation of an episode.
     fn begun(&self, observation: Observation) -> Result<Run> {
         let mut rollout = self.rollout_at(observation)?;
         rollout.correct()?;
@@ -118,7 +118,8 @@ impl DecisionsLearner {
         Ok(Run::begun(rollout, &self.dqn))
     }
 
-    /// Chooses a run's option: the option with the highest value, or a random option that is held for some steps.
+    /// Chooses the option that a robot flies: the option with the highest value, or a random option that it keeps for
+    /// some steps.
     fn choose(&self, index: usize, features: &[f32], held: &mut Held) -> usize {
         if self.is_frozen {
             return self.dqn.best(features);
@@ -127,7 +128,8 @@ impl DecisionsLearner {
         let mut rng = stream(self.config.seed, Purpose::Exploration, step);
         let mut random = |below: u64| rng.next_u64() % below;
         let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
-        // Held options last 2.5 steps on average (with the default settings), so they begin with a lower probability.
+        // A random option lasts 2.5 steps on average (with the default settings), so it begins with a probability below
+        // epsilon.
         if held.n_steps == 0 && (random(1 << 24) as f32) < epsilon / 2.0 * (1 << 24) as f32 {
             held.option = random(OPTIONS.len() as u64) as usize;
             held.n_steps = 1 + random(self.config.decisions.longest_hold);
@@ -154,7 +156,8 @@ impl DecisionsLearner {
         self.runs = runs;
     }
 
-    /// Returns the current factor on the step size, which falls linearly over the configured number of steps.
+    /// Returns the current factor that the step size is multiplied by. It falls linearly over the configured number of
+    /// steps.
     fn rate_share(&self) -> f32 {
         let config = &self.config.decisions;
         let done = self.world_steps as f32 / config.steps.max(1) as f32;

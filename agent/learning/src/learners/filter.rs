@@ -136,7 +136,7 @@ impl FilterLearner {
         }
     }
 
-    /// Creates a robot's rollout before its first correction.
+    /// Creates a robot's rollout, whose belief has not been corrected yet.
     fn rollout_at(&self, observation: Observation) -> Rollout {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));

@@ -1,5 +1,5 @@
 //! The paper's Algorithm 1: a dynamic autoencoder estimates the state, a DQN chooses the objective of the next path,
-//! and shooting finds the path. Both networks learn from every step.
+//! and random shooting finds the path. Both networks learn from every step.
 //!
 //! An iteration computes `h_{k+1}` and the predictor `u_{k+1}` from the frame (eq. 9), the estimate `p_k` by Bayes'
 //! rule (eq. 10), an action from `h` (eq. 17), and a path for it (eq. 15). After the path's frame and reward, Adam
@@ -68,9 +68,11 @@ fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInf
     Ok(())
 }
 
-/// Checks that episodes are long enough for a window. Otherwise, nothing could be learned.
+/// Checks that an episode has at least as many frames as a training window. With shorter episodes, nothing could be
+/// learned.
 fn check_window(config: &AgentConfig, info: &ServerInfo) -> Result<()> {
-    // For recorded worlds, the server reports the length of the shortest episode. Others can be longer.
+    // For recorded worlds, the server reports only the length of the shortest episode, so other episodes can be long
+    // enough.
     let is_cut = info.max_steps > 0 && info.recorded_world.is_none();
     let (window, n_frames) = (
         config.autoencoder.window as u64,
@@ -119,12 +121,13 @@ impl NetworkLearner {
         }
     }
 
-    /// Creates a rollout that continues from the autoencoder's recurrent state, before its next correction.
+    /// Creates a rollout that continues from the autoencoder's recurrent state. Its belief has not been corrected with
+    /// the observation yet.
     fn rollout_at(&self, follower: Follower, observation: Observation) -> Rollout {
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::at(network, follower);
         let names = numbered_states(network.shape().n_states);
-        // The first choice has the first state as its target.
+        // The initial policy is the first choice, whose target is the first state.
         let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
         worlds.rollout(&self.config, first, Box::new(estimator), names, observation)
     }
@@ -202,7 +205,7 @@ impl NetworkLearner {
         let Some(window) = window.filter(Window::has_targets) else {
             return Ok([None; 2]);
         };
-        // Both step sizes depend on the iteration, because eq. 20 compares them.
+        // Like the DQN's step size, this one depends on the iteration, because eq. 20 compares the two.
         let rate = config.step_size.at(self.progress.position.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
         let loss = self.progress.autoencoder.update(&window);

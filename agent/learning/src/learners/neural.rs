@@ -64,10 +64,10 @@ pub struct NeuralLearner {
     reward: RewardEstimate,
     replay: LessonReplay,
     runs: Vec<Run>,
-    /// The saved run of each robot, until the learner is attached.
+    /// The saved run of each robot, kept until the learner is attached to its robots.
     saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
-    /// Updates that are due but not made yet.
+    /// Number of updates that are due but not made yet.
     earned: f64,
     is_frozen: bool,
 }
@@ -116,7 +116,7 @@ impl NeuralLearner {
         self.reward.target().unwrap_or(last)
     }
 
-    /// Creates a robot's rollout before its first correction.
+    /// Creates a robot's rollout, whose belief has not been corrected yet.
     fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
         let filter = self.filter.as_deref();
         let estimator = estimator(&self.network, filter, self.worlds.shape())?;
@@ -176,7 +176,7 @@ impl NeuralLearner {
 }
 
 impl Run {
-    /// Restores a run from a checkpoint. `rollout` must not have been corrected yet.
+    /// Restores a run from a checkpoint. The belief of `rollout` must not have been corrected yet.
     fn restore(saved: SavedRun, mut rollout: Rollout) -> Result<Self> {
         saved.resume_point.restore(&mut rollout.agent)?;
         Ok(Self {

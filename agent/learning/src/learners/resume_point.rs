@@ -33,7 +33,7 @@ impl ResumePoint {
         }
     }
 
-    /// Whether a world's observation equals the saved one.
+    /// Whether a world's observation equals the saved observation.
     pub(super) fn is_of(&self, observation: &Observation) -> bool {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }

@@ -1,4 +1,4 @@
-//! The belief that learners plan on, and resuming from checkpoints.
+//! Tests of the belief that learners plan on, and of resuming from checkpoints.
 
 use crate::beliefs::learned::LearnedModel;
 use crate::beliefs::neural::NeuralModel;

@@ -193,8 +193,8 @@ fn former(name: &str) -> Option<String> {
 
 type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
 
-/// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the states for
-/// errors.
+/// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the states' names for
+/// error messages.
 fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Result<Parts> {
     let mut table = NAMED.iter();
     let parts = match table.find(|(known, _)| *known == name) {

@@ -9,7 +9,7 @@ pub const PLANNERS: &[&PlannerKind] = &[&RANDOM, &SHOOTING, &BEAM, &AHEAD, &BY_O
 
 /// A kind of planner: its constructor, name and properties.
 pub struct PlannerKind {
-    /// Name in the names of policies.
+    /// Name, as it appears in the names of policies.
     pub name: &'static str,
     /// Short description.
     pub about: &'static str,

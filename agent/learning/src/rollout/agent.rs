@@ -19,7 +19,7 @@ use emberwatch_network::Dqn;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The aim that is shown to observers for a random path.
+/// The text that observers see as the aim of a random path.
 const RANDOM_MOVES: &str = "random moves";
 
 const NO_TRUTH: &str = "the policy needs the truth channel: start the server with --publish-truth";
@@ -133,7 +133,7 @@ impl Agent {
         self.plan_for(objective, robots, step)
     }
 
-    /// Plans paths as [`Self::plan`] does, but for the given objective instead of the policy's.
+    /// Plans paths as [`Self::plan`] does, but for the given objective instead of the policy's objective.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
         let aim = if !self.policy.planner.has_goal {
             RANDOM_MOVES.into()
@@ -157,7 +157,7 @@ impl Agent {
         plan_team(planner, values, robots, self.n_moves, random, ROUNDS)
     }
 
-    /// Plans paths as [`Self::plan`] does, but on the given belief instead of the agent's.
+    /// Plans paths as [`Self::plan`] does, but on the given belief instead of the agent's belief.
     #[cfg(test)]
     pub(crate) fn plan_on(&mut self, belief: &Belief, robots: &[Cell], step: u64) -> Vec<Plan> {
         let own = self.estimate.replace(belief.clone());

@@ -52,9 +52,9 @@ pub fn agent(
     Ok(Agent::new(estimator, policy, config, setup))
 }
 
-/// Returns the belief that a policy plans on, the estimate or the predictor. A DQN keeps the one that it was trained
-/// with, because its values refer to paths planned on it. A clairvoyant always plans on the next states. Otherwise, the
-/// settings decide.
+/// Returns the belief that a policy plans on, the estimate or the predictor. A policy with a DQN uses the belief that
+/// was used in the DQN's training, because the DQN's values depend on it. A clairvoyant always plans on the next
+/// states. For all other policies, the settings decide.
 fn basis(policy: &Policy, config: &AgentConfig, learned: &Learned) -> Result<BasisKind> {
     Ok(match policy.goal {
         Goal::Learned if policy.chooses_options() => policy.decisions(learned)?.basis,

@@ -264,8 +264,8 @@ impl Dqn {
         Track::new(self.settings.n_step)
     }
 
-    /// Returns the discount of the next state's value: 0 if the episode terminated, otherwise gamma. The value after a
-    /// truncated episode counts, because the world continues.
+    /// Returns the discount of the next state's value: 0 if the episode terminated, otherwise gamma. After a truncated
+    /// episode, the next state's value still counts, because the world continues.
     pub fn discount(&self, is_terminated: bool) -> f32 {
         if is_terminated {
             0.0
@@ -351,8 +351,8 @@ impl Dqn {
         }
     }
 
-    /// Returns whether a transition fits the DQN. Its input must belong to one candidate, and its next input to all
-    /// candidates.
+    /// Returns whether a transition fits the DQN. The input must contain the features of one candidate, and the next
+    /// input the features of all candidates.
     pub(super) fn fits(&self, transition: &Transition) -> bool {
         transition.input.len() == self.shape.n_inputs
             && transition.next.len() == self.shape.n_numbers()

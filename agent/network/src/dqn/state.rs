@@ -17,7 +17,8 @@ pub struct SavedDqn {
 }
 
 impl Dqn {
-    /// Returns the tensors of a checkpoint: the network and its target network by PyTorch's names, and Adam's moments.
+    /// Returns the tensors of a checkpoint: the variables of the network and of its target network under PyTorch's
+    /// names, and Adam's moments.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
         on_cpu(named_numbers(&self.groups()))
     }

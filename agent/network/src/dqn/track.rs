@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 pub struct Transition {
     /// The input before the action. With several candidates, the features of the chosen candidate.
     pub input: Vec<f32>,
-    /// The action. With several candidates, 0.
+    /// The index of the action. With several candidates, it is always 0.
     pub action: usize,
     /// The reward.
     pub reward: f32,
@@ -35,7 +35,7 @@ impl Track {
         }
     }
 
-    /// Adds the episode's next step. Returns the transition over `n` steps that it completes, whose reward is
+    /// Adds the episode's next step. Returns the transition over `n` steps that this step completes, whose reward is
     /// `r_1 + gamma r_2 + ... + gamma^(n-1) r_n`. Returns `None` for the first `n - 1` steps.
     pub fn add(&mut self, step: Transition) -> Option<Transition> {
         self.open.push_back(step);

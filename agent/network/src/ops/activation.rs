@@ -1,12 +1,12 @@
 //! Dropout, normalisation and ReLU between two convolutions, forward and backward.
 //!
-//! One step precedes the normalisation and one follows it. One of the two steps is ReLU, and the other does nothing
-//! ([`Order`]).
+//! The code has one step before the normalisation and one step after it. [`Order`] determines which of the two is ReLU,
+//! and the other step does nothing.
 //!
 //! Only the planes of channels that dropout keeps are stored. Dropout sets a dropped channel to zero, which
 //! normalisation and ReLU map to a constant, the channel's *floor*. [`Activation::apply`] subtracts the floors, so that
-//! dropped channels are zero and need no computation. The convolution adds the contribution of the floors
-//! ([`super::stage`]).
+//! dropped channels are zero and need no computation. The next convolution adds the contribution of the floors to its
+//! result ([`super::stage`]).
 
 use super::cpu::{Frames, frames, sum};
 use super::norm::{Norm, Sums};
@@ -27,7 +27,7 @@ pub(super) struct Activation {
     /// `None` for the input of the encoder, which is not normalised.
     pub(super) norm: Option<Norm>,
     pub(super) mask: Mask,
-    /// The value of each channel in frames that drop it. All are 0 without dropout.
+    /// The floor of each channel: its value in frames that drop the channel. All floors are 0 without dropout.
     pub(super) floors: Vec<f32>,
 }
 
@@ -104,7 +104,7 @@ impl Activation {
         }
     }
 
-    /// Computes a kept plane `x` from the convolution's result `z`, minus the floor.
+    /// Computes a kept plane `x` of the activation, minus the floor, from the convolution's result `z`.
     #[inline(always)]
     pub(super) fn apply(&self, channel: usize, z: &[f32], x: &mut [f32]) {
         let Some(norm) = &self.norm else {

@@ -130,7 +130,7 @@ impl<'a> CellLoss<'a> {
 }
 
 /// Returns the probability of a channel's binary outcome: `q` if the channel was observed, otherwise `1 - q`. Rounding
-/// can make `q` larger than 1.
+/// can make `q` larger than 1, so `1 - q` is limited to at least 0.
 #[inline(always)]
 fn term(q: f32, hit: bool) -> f32 {
     LOG_FLOOR as f32 + if hit { q } else { (1.0 - q).max(0.0) }

@@ -8,7 +8,7 @@ use super::stage::{Layer, Stage};
 use crate::dropout::Mask;
 use candle_core::{Result, Tensor};
 
-/// The layers after a forward pass over all frames.
+/// A chain of layers after its forward pass over all frames.
 pub(crate) struct Chain {
     stages: Vec<Stage>,
     /// The input of each stage, before its activation.

@@ -5,10 +5,10 @@
 //! [`Conv::add_weight_gradient`] serve both. Maps are `[channels, rows, cols]`, weights
 //! `[kernel rows, kernel cols, large channels, small channels]`.
 //!
-//! All three are matrix products without an im2col copy ([`super::product`]). Each plane is copied once into a
-//! zero-padded buffer. There, the cells that one tap of the kernel reads for all output cells are stored contiguously,
-//! as one *run*. With a stride `s`, the large plane is split into `s * s` parts by the remainders of row and column
-//! modulo `s`, so that runs stay contiguous.
+//! All three functions are matrix products without an im2col copy ([`super::product`]). Each plane is copied once into
+//! a zero-padded buffer. In this buffer, the cells that one position of the kernel (a *tap*) reads for all output cells
+//! are contiguous and form one *run*. With a stride `s`, the large plane is split into `s * s` parts by the remainders
+//! of row and column modulo `s`, so that runs stay contiguous.
 //!
 //! Channels are passed as lists, so that channels removed by dropout are neither read nor computed.
 
@@ -25,7 +25,7 @@ pub(crate) struct Sizes {
     /// Rows and columns of the kernel.
     pub(crate) kernel: [usize; 2],
     pub(crate) stride: usize,
-    /// Number of zeros on each side of the large map.
+    /// Number of rows or columns of zeros on each side of the large map.
     pub(crate) padding: usize,
     /// Distance between neighbouring cells that a kernel reads.
     pub(crate) dilation: usize,
@@ -120,7 +120,7 @@ impl Conv {
         self.sizes.small[1] * self.sizes.small[2]
     }
 
-    /// Returns the number of cells of a split plane, with padding.
+    /// Returns the number of cells of a large plane that is split into parts, with padding.
     fn split(&self) -> usize {
         self.sizes.stride * self.sizes.stride * self.part[0] * self.part[1]
     }
@@ -137,7 +137,7 @@ impl Conv {
         }
     }
 
-    /// Copies a large plane to position `index` of the buffer. The zeros around it stay in place.
+    /// Copies a large plane to position `index` of the buffer. The zeros around the plane stay in place.
     #[inline(always)]
     pub(crate) fn put_large(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         let Sizes {
@@ -172,7 +172,7 @@ impl Conv {
         [self.sizes.large[0], self.sizes.small[0]].map(|n| (0..n).collect())
     }
 
-    /// Copies a small plane to position `index` of the buffer. The zeros around it stay in place.
+    /// Copies a small plane to position `index` of the buffer. The zeros around the plane stay in place.
     #[inline(always)]
     pub(crate) fn put_small(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         let cols = self.sizes.small[2];

@@ -191,7 +191,7 @@ pub(super) fn add_scaled(to: &mut [f32], factor: f32, numbers: &[f32]) {
     }
 }
 
-/// Returns the sum, computed in sixteen lanes.
+/// Returns the sum of numbers, computed in sixteen lanes.
 #[inline(always)]
 pub(super) fn sum(numbers: &[f32]) -> f32 {
     let (numbers, rest) = numbers.as_chunks::<16>();

@@ -1,4 +1,5 @@
-//! A GRU over a sequence as one operator. Its arguments are the inputs' contributions to the gates.
+//! A GRU over a sequence as one operator. The operator takes the inputs' contributions to the gates, not the inputs
+//! themselves.
 
 use super::cpu::{add, add_scaled, derived, numbers};
 use candle_core::{Result, Tensor};
@@ -76,7 +77,7 @@ impl Gru {
         }
     }
 
-    /// Computes the gradients of the inputs, `W_hh` and `b_hh`, concatenated.
+    /// Computes the gradients of `W_ih x + b_ih`, `W_hh` and `b_hh`, concatenated.
     #[inline(always)]
     fn backward(&self, d_out: &[f32]) -> Vec<f32> {
         let n = self.n;

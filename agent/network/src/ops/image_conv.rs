@@ -21,7 +21,7 @@ pub(crate) struct ImageConv {
     pub(crate) kernel: usize,
     pub(crate) stride: usize,
     pub(crate) dilation: usize,
-    /// Whether ReLU follows, which replaces negative results with 0.
+    /// Whether ReLU follows the convolution.
     pub(crate) relu: bool,
 }
 
@@ -65,7 +65,8 @@ impl ImageConv {
 struct Call {
     conv: ImageConv,
     adds_image: bool,
-    /// Whether each result passed ReLU. The output of a residual layer does not reveal this.
+    /// Whether each result passed ReLU. The output of a residual layer does not reveal this, because it includes the
+    /// image.
     kept: OnceLock<Vec<bool>>,
 }
 
@@ -213,7 +214,7 @@ impl CustomOp3 for Call {
     }
 }
 
-/// The inputs that the gradients of all images have in common.
+/// The inputs of the backward pass that are the same for all images.
 struct Back<'a> {
     call: &'a Call,
     conv: &'a Conv,
@@ -288,7 +289,7 @@ mod tests {
         } = conv;
         let (x, bias) = (random(&[batch, 7, 8, 12], 1), random(&[n], 2));
         let weights = random(&[kernel * kernel * 7, n], 3);
-        // An intermediate result, so that candle computes its gradient.
+        // Use an intermediate result as the image, so that candle computes its gradient.
         let image = (x.as_tensor() * 1.0)?;
         let got = conv.apply(&image, &weights, &bias)?;
         let vars = [x, weights, bias];

@@ -103,7 +103,7 @@ pub(super) struct Norm {
     scale: f64,
 }
 
-/// The result of the backward pass.
+/// The result of a normalisation's backward pass.
 pub(super) struct NormGradient {
     pub(super) gamma: Vec<f32>,
     pub(super) beta: Vec<f32>,

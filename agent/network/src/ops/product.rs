@@ -42,7 +42,7 @@ pub(super) fn right_factor<'a>(numbers: &'a [f32], terms: &'a [usize], cols: usi
     }
 }
 
-/// Returns the first `n` multiples of `step`, the offsets of a contiguous matrix's rows.
+/// Returns the first `n` multiples of `step`, which are the row offsets of a contiguous matrix.
 pub(super) fn steps(n: usize, step: usize) -> Vec<usize> {
     (0..n).map(|at| at * step).collect()
 }
@@ -95,7 +95,7 @@ fn compute(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>, ad
     });
 }
 
-/// A product whose indices are checked.
+/// A product whose indices have been checked.
 struct Call<'a> {
     out: &'a mut [f32],
     rows: &'a [usize],

@@ -154,7 +154,7 @@ impl Stage {
     }
 
     /// Computes the results of all frames, and their sums for the next normalisation. `order` is the order of ReLU and
-    /// that normalisation.
+    /// the next normalisation.
     pub(super) fn forward(&self, z: &Frames, order: Order) -> Result<(Frames, Sums)> {
         let (weights, [in_area, area]) = (numbers(&self.weights)?, self.areas());
         let weights = &weights[..];
@@ -319,7 +319,7 @@ impl Stage {
         Ok((part, terms))
     }
 
-    /// Adds the floors' gradients. `start` is the gradient of the results, summed over frames.
+    /// Adds the gradients of the convolution of the floors. `start` is the gradient of the results, summed over frames.
     fn add_gradients_of_floors(
         &self,
         norm: &Norm,

@@ -145,7 +145,8 @@ fn one_action_in_ten_is_random() {
     let dqn = Dqn::new(DqnSettings::paper(), ACTIONS, 1);
     let best = dqn.best(&[0.5; N_INPUTS]);
     let others = (0..1000).filter(|&step| dqn.act(&[0.5; N_INPUTS], step) != best);
-    // Three quarters of the random actions differ from the best: 75 in 1000, with standard deviation 8.
+    // Of 1000 actions, 100 are random, and three quarters of these differ from the best action: 75 are expected, with
+    // standard deviation 8.
     let n_others = others.count();
     assert!((45..105).contains(&n_others), "{n_others}");
 }
@@ -297,7 +298,7 @@ fn it_learns_which_candidate_pays() {
         width: 16,
         ..DqnSettings::paper()
     };
-    // A candidate's reward is its first number. Its second number is irrelevant.
+    // The reward of a candidate is its first feature. The second feature is irrelevant.
     let candidates = |row: u64| -> Vec<f32> { (0..6).map(|at| number(row * 6 + at)).collect() };
     let mut dqn = Dqn::new(settings, DqnShape::of_candidates(2, 3), 1);
     for row in 0..300 {

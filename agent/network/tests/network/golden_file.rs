@@ -1,4 +1,4 @@
-//! Access to arrays of the authors' runs in this crate's `tests/data`.
+//! Access to the arrays in this crate's `tests/data`, which come from runs of the authors' code.
 
 use emberwatch_model::frame::{Frame, UNOBSERVED};
 use emberwatch_model::grid::Shape;

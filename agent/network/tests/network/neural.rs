@@ -140,8 +140,8 @@ fn on_a_device() -> NeuralBelief {
     network.expect("a network")
 }
 
-/// Returns a base distribution. It does not know which of two values the cells in the right half show, because this
-/// depends on the step.
+/// Returns a base distribution. In the right half of the grid, two values are equally probable, because the value that
+/// a cell shows depends on the step.
 fn base_of(cell: usize) -> [f32; 3] {
     if cell % 18 < 9 {
         [0.1, 0.8, 0.1]

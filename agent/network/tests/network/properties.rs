@@ -90,7 +90,7 @@ fn a_loss_at_certainty_is_finite() {
     // Every state shows observation 0 with a probability of exactly 1.
     overwrite(&network, "W_obs_param", &[200.0; 3]);
     let window = window(&network, 8, 20);
-    // The loss of two thirds of the cells is twice the logarithm of 1e-10, negated.
+    // The loss of two thirds of the cells is -2 ln(1e-10).
     let loss = network.update(&window).expect("finite");
     assert!((20.0..46.0).contains(&loss), "{loss}");
 }

@@ -161,7 +161,7 @@ fn on_grids_of_any_sides_with_other_states_and_observations() {
     for (grid, n_states, n_observations, one_in) in [
         ([32, 32], 2, 4, 100),
         ([48, 80], 4, 2, 2),
-        // These grids are padded.
+        // The network pads these grids.
         ([20, 33], 3, 3, 10),
         ([6, 6], 3, 3, 2),
     ] {

@@ -52,7 +52,8 @@ impl<'a> Columns<'a> {
         self.add(heading, cell);
     }
 
-    /// Adds a column of differences from the baseline with as many robots, in team `alone`. They are paired by world.
+    /// Adds a column of differences from the baseline policy with the same number of robots in team `alone`. The
+    /// differences are paired by world.
     pub(super) fn add_difference(
         &mut self,
         groups: &'a [Group<'a>],

@@ -16,10 +16,10 @@ use emberwatch_protocol::{Cell, Frame, Grid, Model, UNOBSERVED};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Label of the reward axis for the wildfire model, whose reward counts these cells.
+/// Label of the reward axis for the wildfire model, whose reward is the number of distinct fire cells found.
 pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";
 
-/// Legend and colour of policies that sample paths on the known model. Policies that search have another colour.
+/// Legend and colour of known-model policies that sample paths. Known-model policies that search have another colour.
 const SHOOTING: (&str, Color) = ("known model, shooting", Color(0x56, 0xb4, 0xe9));
 
 /// Legend and colour of rows from `--add`.
@@ -89,13 +89,13 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
 
 /// The length and the label of a bar.
 pub(super) struct Height {
-    /// NaN: no bar is drawn.
+    /// If the value is NaN, no bar is drawn.
     pub(super) value: f64,
     pub(super) ends: Option<[f64; 2]>,
     pub(super) label: String,
 }
 
-/// Draws one bar per policy, the best at the top, with a mark for each of its runs.
+/// Draws one bar per policy, the best at the top, with a dot for each of the policy's runs.
 pub(super) fn draw_bars(
     path: &Path,
     runs: &[PolicyRun],
@@ -185,8 +185,8 @@ fn chart(group: &Group<'_>) -> (&'static str, Color) {
     chart_of(belief)
 }
 
-/// Draws the total reward of a world's robots against their number, with one curve per kind of team. Draws nothing if
-/// all runs have the same number of robots.
+/// Draws the total reward of a world's robots against the number of robots, with one curve per kind of team. Draws
+/// nothing if all runs have the same number of robots.
 pub fn draw_teams(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
     if runs.iter().all(|run| run.robots == runs[0].robots) {
         return Ok(());
@@ -246,7 +246,7 @@ pub fn draw_snapshot(
         .observations
         .iter()
         .map(|it| named(&it.name, &it.color));
-    // Observations of outer rings have the colours of the observations on the path.
+    // Observations from the sensor's outer rings have the same colours as observations on the path.
     let n_named = file.observations.len() as u8;
     let of_path = |value: u8| {
         if value == UNOBSERVED {

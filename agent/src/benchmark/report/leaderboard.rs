@@ -246,7 +246,7 @@ pub fn check_entries(entries: &[Entry]) -> Result<()> {
     Ok(())
 }
 
-/// Checks that both ends of the scale were measured with the same kind of team.
+/// Checks that the random walk and the oracle, which define the scale, were measured with the same kind of team.
 fn check_scale(entries: &[Entry]) -> Result<()> {
     let teams = |name: &str| {
         let entry = entries.iter().find(|entry| entry.about.policy == name);

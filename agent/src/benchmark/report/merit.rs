@@ -6,7 +6,7 @@ use crate::benchmark::report::policy_run::{Group, PolicyRun};
 
 /// Returns the table with its heading, or `None` if the runs lack the figures of merit, as runs from old files do.
 ///
-/// Differences are differences from `baseline` in the share of burning cells seen, paired by world.
+/// Each difference is a policy's share of burning cells seen minus the share of `baseline`, paired by world.
 pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String> {
     let mut runs = groups.iter().flat_map(|group| &group.runs);
     let recent_steps = runs.find_map(|run| run.recent_steps)?;

@@ -18,7 +18,7 @@ pub struct PolicyRun {
     pub mean_reward: f64,
     /// Mean number of distinct cells visited in a step.
     pub mean_distinct_cells: f64,
-    /// Share of the distinct visited cells that are in the state that pays most, in `0..=1`.
+    /// Share of the distinct visited cells that are in the state with the highest reward, in `0..=1`.
     pub hit_rate: f64,
     /// Mean number of burning cells of the world.
     pub mean_fire_cells: f64,
@@ -44,7 +44,7 @@ pub struct PolicyRun {
     pub recent_steps: Option<u32>,
     /// Share of the burning cells that were seen in the last `recent_steps` steps.
     pub burning_seen_share: Option<f64>,
-    /// Moves from the nearest robot to the nearest burning cell that was not seen in these steps.
+    /// Moves from the nearest robot to the nearest burning cell that was not seen in the last `recent_steps` steps.
     pub front_distance: Option<f64>,
     /// Share of the grid's cells that were ever seen.
     pub grid_seen_share: Option<f64>,
@@ -101,7 +101,7 @@ impl Group<'_> {
         (self.robots, self.team) != (1, ALONE)
     }
 
-    /// Returns the policy's name, with marks that distinguish the group from other groups of the policy.
+    /// Returns the policy's name, followed by labels that distinguish the group from the policy's other groups.
     pub(super) fn name(&self, groups: &[Self]) -> String {
         match self.marks(groups).as_slice() {
             [] => self.policy.into(),
@@ -109,7 +109,8 @@ impl Group<'_> {
         }
     }
 
-    /// Returns the marks that distinguish the group from the policy's other groups: estimator and team, if they differ.
+    /// Returns the labels that distinguish the group from the policy's other groups: estimator and team, if they
+    /// differ.
     pub(super) fn marks(&self, groups: &[Self]) -> Vec<String> {
         let twins = || groups.iter().filter(|other| other.policy == self.policy);
         let mut marks = Vec::new();

@@ -1,6 +1,7 @@
 //! The CSV file of runs, which only one process at a time can replace.
 //!
-//! `emberwatch.benchmark` in Python locks and replaces it in the same way, so that no writer loses another's rows.
+//! `emberwatch.benchmark` in Python locks and replaces the file in the same way, so that no writer loses another's
+//! rows.
 
 use crate::benchmark::report::policy_run::PolicyRun;
 use anyhow::{Context, Result, bail, ensure};
@@ -40,7 +41,7 @@ impl RunsFile {
         Ok(locked)
     }
 
-    /// Reads the file's runs. A new file has none.
+    /// Reads the file's runs. A new file contains no runs.
     pub fn read(&self) -> Result<Vec<PolicyRun>> {
         read_runs(&self.path)
     }

@@ -56,7 +56,7 @@ impl Aggregate {
     ///
     /// The interval comes from a stratified bootstrap. Each draw resamples the worlds of each task with replacement,
     /// both for the policy's rewards and for the ends of the scale. Policies on the same worlds use the same draws.
-    /// Draws in which a task's ceiling is not above its floor have no scale and are left out.
+    /// Draws in which the oracle is not better than the random walk in some task have no scale and are left out.
     pub fn of(tasks: &[Vec<WorldRewards>]) -> Option<Self> {
         let mean = score(tasks.iter().map(|worlds| worlds.iter().copied()))?;
         if tasks.iter().any(|worlds| worlds.len() == 1) {
@@ -214,7 +214,8 @@ fn score(tasks: impl Iterator<Item = impl Iterator<Item = WorldRewards>>) -> Opt
     (!scores.is_empty()).then(|| interquartile_mean(scores))
 }
 
-/// Returns each world's score, scaled from the mean floor to the mean ceiling; `None` if the ceiling is not higher.
+/// Returns each world's score, on a scale from the random walk's mean over the worlds (0) to the oracle's (1). Returns
+/// `None` if the oracle's mean is not the higher one.
 fn scaled(worlds: &[WorldRewards]) -> Option<Vec<f64>> {
     let n = worlds.len() as f64;
     let floor = worlds.iter().map(|it| it.floor).sum::<f64>() / n;
@@ -223,7 +224,7 @@ fn scaled(worlds: &[WorldRewards]) -> Option<Vec<f64>> {
     (ceiling > floor).then(|| worlds.iter().map(score).collect())
 }
 
-/// Returns the mean without the lowest and the highest quarter of the numbers, each rounded down.
+/// Returns the mean without the lowest and the highest quarter of the numbers. The size of a quarter is rounded down.
 fn interquartile_mean(mut numbers: Vec<f64>) -> f64 {
     numbers.sort_by(f64::total_cmp);
     let n_cut = numbers.len() / 4;

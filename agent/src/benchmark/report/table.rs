@@ -8,7 +8,7 @@ use crate::benchmark::report::statistics::ratio_of_means;
 use comfy_table::Table;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Estimator label of the oracles. The table shows rewards as a percentage of the best oracle's.
+/// Estimator label of the oracles. The table shows rewards as a percentage of the best oracle's reward.
 const TRUTH: &str = "truth";
 
 /// Renders the rewards and figures of merit of every policy over all worlds, then the rewards by amount of fire.
@@ -83,7 +83,7 @@ fn rewards(group: &Group<'_>) -> impl Iterator<Item = f64> {
     group.by_seed(reward).into_values()
 }
 
-/// Renders a group's reward as a percentage of the best oracle's with the same number of robots.
+/// Renders a group's reward as a percentage of the reward of the best oracle with the same number of robots.
 fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
     let wanted = (TRUTH, group.robots);
     let oracles = groups.iter();
@@ -95,8 +95,8 @@ fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
     ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
 }
 
-/// Renders mean rewards over the half of the worlds with less fire, and over the half with more. If the number of
-/// worlds is odd, the middle world belongs to the half with more.
+/// Renders mean rewards over the half of the worlds with less fire, and over the half with more fire. If the number of
+/// worlds is odd, the middle world belongs to the half with more fire.
 fn split_by_fire(runs: &[PolicyRun], groups: &[Group<'_>]) -> String {
     let mut fire_of: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
     for run in runs {

@@ -15,7 +15,7 @@ use std::marker::PhantomData;
 use std::ops::Range;
 use std::time::Duration;
 
-/// A connection, which cannot exist here.
+/// A connection, which cannot exist on these systems.
 pub struct Connection(Infallible);
 
 impl Connection {
@@ -44,7 +44,7 @@ impl Backend for Connection {
     }
 }
 
-/// An observer, which cannot exist here.
+/// An observer, which cannot exist on these systems.
 pub struct Observer<H>(Infallible, PhantomData<H>);
 
 impl Observer<FrameHeader> {
@@ -74,7 +74,7 @@ impl<H> Observer<H> {
     }
 }
 
-/// A channel that nobody can observe.
+/// A channel that publishes nothing, because nobody can observe it.
 pub struct Feed;
 
 /// A belief for observers.
@@ -92,7 +92,7 @@ impl Feed {
         Self
     }
 
-    /// Returns no worlds: none is due for publishing.
+    /// Returns an empty list, because no world is ever published.
     pub fn due(&self, _: usize) -> Vec<usize> {
         Vec::new()
     }

@@ -5,8 +5,8 @@ Importing this package registers its environments with Gymnasium:
     import gymnasium, emberwatch
     env = gymnasium.make("emberwatch/Wildfire-v0")
 
-Worlds are simulated in this process. With `instance="lab"`, a running `emberwatch-server` simulates
-them. To work without Gymnasium, `connect` to a running server, or `observe` what it publishes.
+Worlds are simulated in this process, or with `instance="lab"` by a running `emberwatch-server`. To
+work without Gymnasium, `connect` to a running server, or `observe` what it publishes.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _register(task: Task, /, **keywords: Any) -> None:
 
 
 _TASKS = built_in_tasks()
-# Registered without `task`: these are the default worlds, and keywords may change any setting.
+# The default worlds are registered without `task`, so that keywords may change any setting.
 _register(_TASKS.pop("wildfire"))
 for _name, _task in _TASKS.items():
     _register(_task, task=_name)

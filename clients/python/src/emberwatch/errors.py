@@ -1,6 +1,6 @@
 """The errors of this package. All are an `EmberwatchError`, whose `code` names the cause.
 
-A cause has a subclass only where callers handle it differently.
+Only causes that callers handle differently have a subclass of their own.
 """
 
 from typing import Final, Self
@@ -9,7 +9,7 @@ from emberwatch._native import explain
 
 
 class EmberwatchError(Exception):
-    """Base of all errors of this package.
+    """Base class of all errors of this package.
 
     Attributes:
         code: The cause. If the server refused a request, the name of the status (PROTOCOL.md
@@ -21,8 +21,8 @@ class EmberwatchError(Exception):
             needs, failed), `"bad_answer"` (client and server are of different releases),
             `"program"` (a prior or a network failed), `"pid_namespace"` (the server runs in a
             different PID namespace), `"impossible_frame"` and `"recording"`.
-        detail: A number that comes with a refusal. Its meaning depends on the status; 0 if it has
-            none.
+        detail: A number that comes with a refusal. Its meaning depends on the status; 0 if there is
+            no number.
     """
 
     code: str = "unknown"
@@ -73,7 +73,7 @@ class NotEnoughMemoryError(EmberwatchError, MemoryError):
 
 
 class RequestTimeoutError(EmberwatchError, TimeoutError):
-    """The answer did not come in time. The step may still have run: observe before the next one."""
+    """No answer came in time. The step may still have run, so observe before the next one."""
 
     code = "timeout"
 
@@ -92,7 +92,7 @@ _CLASSES: Final = {"lease_lost": LeaseLostError, "no_memory": NotEnoughMemoryErr
 
 
 def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchError:
-    """Returns the error for a nonzero status code; its text is `message`, or the status's own."""
+    """Returns the error for a nonzero status code, with `message` or the status's own text."""
     known = explain(status, detail)
     if known is None:
         message = message or f"the server refused: status {status}, detail {detail}"

@@ -25,13 +25,13 @@ from emberwatch.errors import InvalidArgumentError, invalid
 
 
 def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
-    """Makes a vector environment for Stable-Baselines3, as `gymnasium.make_vec` does.
+    """Makes a vector environment for Stable-Baselines3 with `gymnasium.make_vec`.
 
     For episode statistics, wrap it in Stable-Baselines3's `VecMonitor`.
 
     Args:
         name: The environment's name, such as ``"emberwatch/WildfireMoves-v0"``.
-        n_envs: Number of robots, `num_envs` of the vector environment.
+        n_envs: Number of robots, which is `num_envs` of the vector environment.
         keywords: The environment's keywords.
     """
     made = gymnasium.make_vec(
@@ -43,7 +43,7 @@ def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
 class WildfireVecEnv(VecEnv):
     """A native vector environment in autoreset mode `SAME_STEP`.
 
-    The info of a world is empty, except at the end of its episode. Then it has
+    The info of a world is empty, except at the end of its episode. At the end it has
     `terminal_observation`, `TimeLimit.truncated` and the info of the last complete path.
     """
 

@@ -32,8 +32,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     Emberwatch's environments report the world's step k in ``info["step"]``, and the belief follows
     it. After a step that makes only one move of a path, the belief stays as it is. After a step
-    that flies several paths, it predicts once per path and corrects with the last frame. In
-    environments that do not report k, each step of the environment counts as one step of the world.
+    that flies several paths, the belief is predicted once per path and corrected with the last
+    frame. In environments that do not report k, each step of the environment counts as one step of
+    the world.
 
     ## Observations
     After `reset`, the observation is the prior about ``X_0``, the world after its burn-in. A step
@@ -44,14 +45,14 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     `emberwatch.belief.Transition`.
 
     - ``dtype="float32"``: a `Box` of 0 to 1, shape (S, H, W). The S numbers of a cell sum to 1.
-    - ``dtype="uint8"``: the same times 255, rounded, shape (H, W, S). This is an image for
+    - ``dtype="uint8"``: the same numbers times 255, rounded, shape (H, W, S). This is an image for
       convolutional policies, for example in Stable-Baselines3.
     - ``keep=True``: a `Dict` of the original observations (a single frame as ``"frame"``) and
       ``"belief"``.
 
     ## Priors
-    - ``"simulated"``: the share of 64 simulated worlds with each cell in each state after the
-      burn-in. The first simulation takes some seconds; later ones are read from
+    - ``"simulated"``: how often each cell is in each state after the burn-in of 64 simulated
+      worlds. The simulation takes some seconds; later calls read its result from
       ``~/.cache/emberwatch``.
     - ``"initial"``: the model's initial distribution, which is exact for worlds without burn-in.
     - ``"uniform"``: every state equally likely.
@@ -64,10 +65,10 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     - `keep`, `dtype`: what is observed, as above.
     - `prior`: one of the priors above.
     - `model`: a `Model`, its name, or the path or the text of its file. The default is
-      ``env.unwrapped.model``. Needed only for servers that do not reveal their model.
+      ``env.unwrapped.model``. It is needed only for servers that do not reveal their model.
     - `kind`: the kind of belief, a key of `emberwatch.belief.kinds`.
     - `checkpoint`: a file written by `emberwatch-agent train`. The belief is then the one that
-      `emberwatch.belief.load` returns, with its own prior and S. It needs no model.
+      `emberwatch.belief.load` returns, with its own prior and S. A checkpoint needs no model.
     """
 
     def __init__(
@@ -134,7 +135,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
         self._belief.reset()
-        self._belief.correct(_frame_of(observation))  # the frame is empty, unless resumed
+        self._belief.correct(_frame_of(observation))  # empty, unless an episode was resumed
         self._is_begun = True
         return self._observe(observation), info
 
@@ -152,7 +153,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     @contextmanager
     def _between(self) -> Generator[None]:
-        """Marks the belief as outdated during a call; if the call is refused, nothing changed."""
+        """Marks the belief as outdated during a call, and as valid again if the call is refused."""
         was_begun, self._is_begun = self._is_begun, False
         try:
             yield

@@ -23,7 +23,7 @@ impl Simulator {
         deadlines.min()
     }
 
-    /// Withdraws a request whose client no longer waits for its answer.
+    /// Withdraws a step request whose client has stopped waiting for the answer.
     pub fn cancel_step(&mut self, now: Instant, ticket: Ticket) {
         for &world in &self.waiting_worlds {
             let barrier = &mut self.places[world].barrier;
@@ -34,9 +34,9 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Returns the next answer to a request that waited, and writes its results and frames to `payload`. Before the
-    /// next request is handled, call this until it returns `None`, because answers show the current step of their
-    /// worlds.
+    /// Returns the next answer to a request that waited, and writes its results and frames to `payload`. Call this
+    /// until it returns `None` before handling the next request, because an answer shows the current step of its
+    /// worlds, which the next request may change.
     pub fn next_answer(&mut self, payload: &mut Vec<u8>) -> Option<(Ticket, StepReply)> {
         let (waiter, outcome) = self.settled.pop_front()?;
         payload.clear();
@@ -50,12 +50,14 @@ impl Simulator {
         Some((waiter.ticket, reply))
     }
 
-    /// Returns the worlds that have moved since the last call although no request completed their paths.
+    /// Returns the worlds that have moved since the last call for another reason than a step request, such as a
+    /// deadline.
     pub fn take_moved(&mut self) -> Vec<usize> {
         std::mem::take(&mut self.moved)
     }
 
-    /// Refuses waiting requests whose lease has lost a robot, and moves the worlds that no longer wait for a path.
+    /// Refuses waiting requests whose lease has lost a robot, and moves the worlds for which no path is missing any
+    /// more.
     pub(super) fn settle(&mut self, now: Instant) {
         for world in self.waiting_worlds.clone() {
             let robots = self.robots_of(world);
@@ -90,14 +92,14 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Returns whether a world can move now.
+    /// Returns whether a world has the paths for its next step, or its deadline has passed.
     pub(super) fn is_complete(&self, now: Instant, world: usize) -> bool {
         let held = self.leases.held(self.robots_of(world));
         self.places[world].barrier.is_complete(held, now)
     }
 
-    /// Moves worlds by one step with the paths that have arrived. If given, `parts` contains each world's part of an
-    /// answer. The thread that steps a world also writes the world's part.
+    /// Moves worlds by one step with the paths that have arrived. If `parts` is given, it contains one part of an
+    /// answer for each world, which is written by the thread that steps the world.
     pub(super) fn advance(
         &mut self,
         now: Instant,

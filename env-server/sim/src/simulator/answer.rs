@@ -42,8 +42,8 @@ impl Part<'_> {
         self.frames.fill(UNOBSERVED);
         for robot in episode.robots() {
             let seen = robot.frame().as_bytes();
-            // Robots that see a cell in the same ring have the same reading of it. Otherwise the reading of the inner
-            // ring is kept, which has the smaller value.
+            // Robots that see a cell in the same sensor ring have the same reading of it. If the rings differ, the
+            // minimum keeps the reading of the inner ring, which has the smaller value.
             (self.frames.iter_mut().zip(seen)).for_each(|(to, &value)| *to = value.min(*to));
         }
     }
@@ -71,7 +71,7 @@ impl Simulator {
         }
     }
 
-    /// Returns the header of a successful answer and the robots that it covers.
+    /// Returns the header of a successful answer, and the robots in the answer.
     pub(super) fn answer(&self, request: &StepRequest) -> (StepReply, Range<usize>) {
         let first = request.first_robot as usize;
         let robots = first..first + request.n_robots as usize;
@@ -96,14 +96,15 @@ impl Simulator {
         n_worlds * WORLD_BYTES + n_robots * ROBOT_BYTES + n_frames * n_cells
     }
 
-    /// Resizes a payload to the length of the answer, before any state changes, so that a refusal has no effect.
+    /// Resizes a payload to the length of the answer. This happens before any state changes, so that a request refused
+    /// for lack of memory has no effect.
     pub(super) fn reserve(
         &self,
         request: &StepRequest,
         payload: &mut Vec<u8>,
     ) -> Result<(), Refusal> {
         let n_bytes = self.n_bytes(request);
-        // Tries to allocate the memory first, because the process would abort if the allocation in `fit` failed.
+        // Tries the allocation first, because a failed allocation in `fit` would abort the process.
         let mut probe = Vec::<u8>::new();
         let n_more = n_bytes.saturating_sub(payload.capacity());
         let reserved = probe.try_reserve_exact(if n_more == 0 { 0 } else { n_bytes });
@@ -118,8 +119,8 @@ impl Simulator {
     pub(super) fn fit(&self, request: &StepRequest, payload: &mut Vec<u8>) {
         let n_bytes = self.n_bytes(request);
         if payload.capacity() < n_bytes {
-            // Allocates new zeroed memory instead of resizing, so that the threads that write the pages are the first
-            // to touch them.
+            // Allocates zeroed memory instead of resizing, so that no page is touched before the threads write their
+            // parts.
             *payload = vec![0; n_bytes];
         } else {
             payload.resize(n_bytes, 0);
@@ -160,7 +161,7 @@ impl Simulator {
     }
 
     /// Writes the results and frames of the requested robots at past steps, and returns the header. `steps` contains
-    /// one kept step per world.
+    /// one step number per world, and the world's history contains that step.
     pub(super) fn write_past(
         &self,
         request: &StepRequest,
@@ -199,7 +200,7 @@ impl Simulator {
     }
 }
 
-/// Splits off the first `n` bytes.
+/// Splits off and returns the first `n` bytes.
 fn take<'a>(bytes: &mut &'a mut [u8], n: usize) -> &'a mut [u8] {
     let (first, rest) = std::mem::take(bytes).split_at_mut(n);
     *bytes = rest;

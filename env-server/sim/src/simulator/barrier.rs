@@ -1,4 +1,5 @@
-//! The barrier of a world: the paths and waiting requests for its next step, without leases or a clock.
+//! The barrier of a world, which collects the paths and the waiting requests for the next step. It knows neither leases
+//! nor a clock.
 
 use super::lease::ClientId;
 use emberwatch_messages::message::StepRequest;
@@ -26,7 +27,7 @@ pub(super) struct Barrier {
     pub moves: Vec<Move>,
     /// Robots that have a path.
     pub ready: u64,
-    /// Robots that observe every cell.
+    /// Robots that observe every cell in this step.
     pub full: u64,
     /// The time at which the world moves even if paths are missing.
     pub deadline: Option<Instant>,
@@ -60,7 +61,7 @@ impl Barrier {
         }
     }
 
-    /// Removes and returns the requests for which `is_over` holds, together with their paths.
+    /// Removes and returns the requests for which `is_over` returns true, and removes their paths.
     pub fn withdraw(&mut self, is_over: impl Fn(&Waiter) -> bool) -> Vec<Waiter> {
         let over: Vec<Waiter> = self
             .waiters
@@ -75,13 +76,15 @@ impl Barrier {
         over
     }
 
-    /// Returns whether the world can move: a path has arrived, and none is missing or the deadline has passed.
+    /// Returns whether the world can move: at least one path has arrived, and either no path is missing or the deadline
+    /// has passed.
     pub fn is_complete(&self, held: u64, now: Instant) -> bool {
         let is_due = self.deadline.is_some_and(|deadline| deadline <= now);
         self.ready != 0 && (held & !self.ready == 0 || is_due)
     }
 
-    /// Starts to collect paths for the next step. Returns the requests that waited for the current step.
+    /// Removes all paths after a step, so that paths for the next step can arrive. Returns the requests that waited for
+    /// the step.
     pub fn clear(&mut self) -> Vec<Waiter> {
         (self.ready, self.full, self.deadline) = (0, 0, None);
         std::mem::take(&mut self.waiters)

@@ -1,4 +1,5 @@
-//! Tests of the barrier: paths in any order, deadlines, and holders that leave. Time is simulated.
+//! Tests of the barrier: paths in any order, deadlines, and clients that give up or lose their robots. Time is
+//! simulated.
 
 use super::barrier::Ticket;
 use super::lease::ClientId;
@@ -155,8 +156,8 @@ impl Lab {
         self.simulator.episode(0).expect("ready")
     }
 
-    /// Checks that world 0 equals a world that is stepped directly, given for each step the masks of the robots that
-    /// fly, hover and are late.
+    /// Checks that world 0 equals a world that is stepped directly. `steps` contains, for each step, the masks of the
+    /// robots that fly, hover and are late.
     fn assert_is_as_after(&self, steps: &[(u64, u64, u64)]) {
         let spec = self.simulator.spec();
         let mut expected = Episode::new(&spec.rules, 0);
@@ -310,7 +311,7 @@ fn the_path_of_a_process_that_ended_is_dropped_without_delay() {
     assert_eq!(lab.answers(), [(waiting, Status::Ok, 1)]);
     lab.assert_is_as_after(&[(0b010, 0b101, 0)]);
 
-    // The client's connection closes, but its process lives.
+    // The client's connection closes, but its process is still running.
     let lease = lab.acquire(4, 0, 1, false);
     let waiting = lab.waits(4, lease, (0, 1), 1);
     lab.simulator
@@ -426,7 +427,7 @@ fn a_world_is_reset_only_by_the_holder_of_all_held_robots() {
     assert_eq!(refused.status(), Status::Busy);
     let waiting = lab.waits(1, leases[0], (0, 1), 0);
     for (pid, lease) in [(2, leases[1]), (3, leases[2])] {
-        // Client 1 takes the robot over first; otherwise the last release would move the world.
+        // Client 1 takes each robot over before its lease is released; otherwise the last release would move the world.
         lab.acquire(1, pid - 1, 1, true);
         let release = Request::Release { lease };
         assert_eq!(lab.ask(pid, &release).status(), Status::LeaseLost);

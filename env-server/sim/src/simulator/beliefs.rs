@@ -4,16 +4,17 @@ use crate::world::WorldOutcome;
 use emberwatch_messages::control::{BeliefInfo, MAX_BELIEF_PART};
 use std::ops::Range;
 
-/// Minimum number of states for which a belief has space. A learned model can have more states than the true one.
+/// Minimum number of states for which there is space in a belief, because a learned model can have more states than the
+/// true model.
 const N_STATES: usize = 18;
 
-/// Maximum size of the data other than `f32` grids, in bytes.
+/// Maximum size in bytes of the data in a belief besides its `f32` grids.
 const MORE_BYTES: u64 = 32 << 10;
 
 /// The stored beliefs, at most one per robot.
 #[derive(Debug)]
 pub struct Beliefs {
-    /// Maximum length of a belief in bytes: an `f32` per state and cell, another per cell, and [`MORE_BYTES`].
+    /// Maximum length of a belief in bytes: one `f32` per state and cell, one more `f32` per cell, and [`MORE_BYTES`].
     longest: u64,
     left: Vec<Option<StoredBelief>>,
 }
@@ -46,7 +47,7 @@ impl Beliefs {
         }
     }
 
-    /// Appends a part to the belief about a robot's world at its current step. Offset 0 starts a new belief.
+    /// Appends a part to the belief about a robot's world at its current step. A part at offset 0 starts a new belief.
     pub fn add(
         &mut self,
         robot: usize,

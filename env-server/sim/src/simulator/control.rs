@@ -42,7 +42,7 @@ impl Simulator {
         })
     }
 
-    /// Returns the answer to a waiting request once its worlds are ready, and `None` before.
+    /// Returns the answer to a waiting request, or `None` if its worlds are not ready yet.
     pub fn pending_reply(&mut self, now: Instant, pending: &PendingReply) -> Option<Reply> {
         let mut worlds = pending.worlds.iter();
         if worlds.any(|&world| self.episode(world).is_none()) {
@@ -51,7 +51,7 @@ impl Simulator {
         let worlds = pending.worlds.iter();
         let worlds = worlds.map(|&world| self.world_info(world)).collect();
         let held = self.leases.robots_held(pending.lease);
-        // A burn-in that takes longer than the lease lasts must not end the lease.
+        // Renews the lease, so that a burn-in longer than the lease's time to live does not end it.
         self.leases.end_wait(now, pending.lease);
         if !pending.describes_lease {
             return Some(Reply::Reset { worlds });
@@ -295,7 +295,8 @@ impl Simulator {
     }
 }
 
-/// Describes no-fly cells and the sensor. Returns `None` for an open grid whose sensor sees only the path.
+/// Describes no-fly cells and the sensor. Returns `None` if there are no no-fly cells and the sensor sees only the
+/// path.
 fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
     let file = model.file();
     let sensor = file.sensor.clone().unwrap_or_default();

@@ -1,4 +1,5 @@
-//! Leases: which client may fly which robots, and until when. Pure functions: time and tokens are arguments.
+//! Leases: which client may fly which robots, and until when. The functions here are pure: the time and new tokens are
+//! arguments.
 //!
 //! A lease covers robots with consecutive numbers. It ends when it is released, expires or loses its last robot to a
 //! takeover, or when its client's connection or process ends. A robot taken from a lease stays lost to that lease, even
@@ -9,7 +10,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Number of ended leases that are remembered, to distinguish a lost lease from one that never existed.
+/// Number of ended leases that are remembered, so that an ended lease can be distinguished from one that never existed.
 const REMEMBERED: usize = 1024;
 
 /// The connection and process behind a request.
@@ -34,7 +35,8 @@ pub struct Lease {
     expires: Instant,
     /// The process that last took over one of the lease's robots.
     taken_by: Option<u32>,
-    /// Number of requests that wait for resets or for other clients' paths. The lease cannot expire meanwhile.
+    /// Number of the lease's requests that wait for resets or for other clients' paths. While it is positive, the lease
+    /// cannot expire.
     n_waiting: u32,
 }
 
@@ -59,7 +61,7 @@ pub struct Leases {
 struct Ended {
     token: u64,
     first_robot: usize,
-    /// The process that took over the last robot, if this ended the lease.
+    /// The process that took over the last robot, if that takeover ended the lease.
     taken_by: Option<u32>,
 }
 
@@ -70,7 +72,7 @@ pub struct Claim {
     pub robots: Range<usize>,
     /// Whether to take robots over from their holders.
     pub takeover: bool,
-    /// Time for which the lease lasts without use.
+    /// Time after its last use at which the lease expires.
     pub time_to_live: Duration,
 }
 
@@ -201,7 +203,7 @@ impl Leases {
         }
     }
 
-    /// Ends a wait counted by [`Self::begin_wait`]. The time that the lease lasts without use starts again at `now`.
+    /// Ends a wait counted by [`Self::begin_wait`]. This counts as a use of the lease at `now`.
     pub fn end_wait(&mut self, now: Instant, token: u64) {
         if let Some(lease) = self.live.get_mut(&token) {
             lease.n_waiting = lease.n_waiting.saturating_sub(1);

@@ -8,15 +8,15 @@ use emberwatch_messages::message::Status;
 use std::ops::Range;
 use std::time::Duration;
 
-/// The work and the answer that follow a control request.
+/// The result of a control request: work that the caller must do, and the answer.
 pub enum Outcome {
     /// An immediate answer.
     Answer(Reply),
-    /// Resets to run, and an answer when the requested worlds are ready.
+    /// Resets to run, and an answer that follows when the requested worlds are ready.
     Pending(Vec<ResetJob>, PendingReply),
     /// Worlds to publish to observers, and an immediate answer.
     Changed(Range<usize>, Reply),
-    /// A file to read or write, and an answer when that is done.
+    /// A file to read or write, and an answer that follows when this is done.
     File(Job, PendingFile),
     /// An immediate answer, after which the server ends.
     Shutdown,
@@ -31,7 +31,7 @@ pub struct PendingReply {
     pub(super) describes_lease: bool,
 }
 
-/// The part of a status reply that the simulator does not know.
+/// The parts of a status reply that the simulator does not know and its caller provides.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ServerStats {
     pub uptime: Duration,
@@ -46,9 +46,9 @@ pub struct ServerStats {
 /// A reply that waits for a file.
 #[derive(Debug)]
 pub enum PendingFile {
-    /// A snapshot: the worlds that are written.
+    /// A snapshot is being written; contains the worlds in it.
     Saved(Vec<WorldInfo>),
-    /// A restore: the worlds that will be replaced, and the lease under which the client asked.
+    /// A restore: the worlds that will be replaced, and the lease under which the client requested it.
     Restored {
         lease: u64,
         client: ClientId,

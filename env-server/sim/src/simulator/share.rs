@@ -4,7 +4,7 @@ use rayon::{Scope, ThreadPool};
 use std::sync::{Mutex, PoisonError};
 
 /// Runs all jobs on the calling thread and on the threads of a pool. Each thread takes the next job when it has
-/// finished one, so that a thread that wakes up late delays no job.
+/// finished one, so that no job waits for a thread that wakes up late.
 pub(super) fn share<J: Send>(
     threads: &ThreadPool,
     n_jobs: usize,
@@ -28,7 +28,7 @@ pub(super) fn share<J: Send>(
     });
 }
 
-/// Starts a helper thread, which starts two further helpers before it works. Waking all helpers from one thread would
+/// Starts a helper thread, which starts two further helpers before it works. If one thread woke all helpers, this would
 /// take as long as many jobs.
 fn start<'s>(scope: &Scope<'s>, helper: usize, n_helpers: usize, work: &'s (impl Fn() + Sync)) {
     if helper < n_helpers {

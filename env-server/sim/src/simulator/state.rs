@@ -23,9 +23,9 @@ pub struct Simulator {
     pub(super) leases: Leases,
     /// Worlds for which requests wait.
     pub(super) waiting_worlds: Vec<usize>,
-    /// Requests whose wait is over but which are not answered yet. `Err` contains a refusal.
+    /// Step requests that have stopped waiting but are not answered yet. A request that is to be refused has an `Err`.
     pub(super) settled: VecDeque<(Waiter, Result<(), Refusal>)>,
-    /// Worlds that moved although no request completed their paths.
+    /// Worlds that moved for another reason than a step request, such as a deadline.
     pub(super) moved: Vec<usize>,
     pub(super) n_tickets: u64,
     pub(super) threads: ThreadPool,
@@ -40,10 +40,10 @@ pub(super) struct Place {
     pub barrier: Barrier,
 }
 
-/// A world that is ready, or that is in its burn-in.
+/// A world, which is either ready or in its burn-in.
 pub(super) enum Slot {
     Ready(Box<Episode>),
-    /// `last` and `cells` are the world's outcome and its robots' cells before the reset.
+    /// A world in its burn-in. `last` and `cells` are its outcome and its robots' cells before the reset.
     Resetting {
         last: WorldOutcome,
         cells: Vec<[u32; 2]>,
@@ -107,7 +107,7 @@ impl Simulator {
         self.beliefs.forget(self.robots_of(world));
     }
 
-    /// Returns the specification that worlds must fit.
+    /// Returns the specification of the worlds, which worlds read from snapshots must fit.
     pub fn spec(&self) -> &WorldSpec {
         &self.spec
     }
@@ -209,7 +209,7 @@ fn checked(first: u32, n: u32, n_all: usize, otherwise: Status) -> Result<Range<
     Err(Refusal::new(otherwise, n_all as u64))
 }
 
-/// Intersects `robots` with the robots of a world. Returns the result as indices within the world.
+/// Intersects `robots` with the robots of a world. Returns a range of indices within the world.
 pub(super) fn within(robots: &Range<usize>, of_world: Range<usize>) -> Range<usize> {
     let (first, end) = (of_world.start, of_world.end);
     robots.start.max(first) - first..robots.end.min(end) - first
@@ -236,7 +236,7 @@ impl Slot {
 }
 
 impl ResetJob {
-    /// Simulates the burn-in. This is the slow part, which any thread can do.
+    /// Simulates the burn-in. This is the slow part of a reset, and any thread can run it.
     pub fn run(self, rules: &Rules) -> (usize, Box<Episode>) {
         let episode = match self.before {
             None => Box::new(Episode::numbered(rules, self.seed, self.episode)),

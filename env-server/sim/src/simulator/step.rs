@@ -2,10 +2,11 @@
 //!
 //! A refused request changes nothing. Clients are not trusted: no bytes or numbers in a request may cause a panic.
 //!
-//! The order of the checks is: version, operation, robots and flags first, memory for the answer last. In between, a
-//! step checks path length, payload length, moves, coverage, lease, completeness, readiness (`resetting`,
-//! `episode_over`), k and waiting paths (`busy`). `observe` checks payload length and readiness; `recall` checks these,
-//! and whether the steps are kept.
+//! The checks run in this order. Version, operation, robots and flags come first, and the memory for the answer comes
+//! last. In between, a step request is checked for path length, payload length, moves, coverage, lease, completeness,
+//! readiness (`resetting`, `episode_over`), k and waiting paths (`busy`). An `observe` request is checked for payload
+//! length and readiness. A `recall` request is checked for the same, and for whether the steps are still in the
+//! history.
 
 use super::barrier::{Ticket, Waiter, mask};
 use super::lease::{ClientId, Refusal};
@@ -33,9 +34,9 @@ enum Granted<'a> {
     Written,
     /// The answer shows the current step of the worlds.
     Present,
-    /// The answer shows past steps: one step number for each world, as bytes.
+    /// The answer shows past steps. Contains one step number for each world, as bytes.
     Past(&'a [u8]),
-    /// The world waits for other paths.
+    /// The request waits, because its world still lacks other paths.
     Waits(Ticket),
 }
 
@@ -107,8 +108,8 @@ impl Simulator {
         }
     }
 
-    /// Stores the paths of a checked request. Moves its worlds and writes the answer, unless the request is for one
-    /// world that still waits for other paths. In that case, returns the ticket.
+    /// Stores the paths of a checked request. If no path is missing, moves the request's worlds, writes the answer and
+    /// returns `None`. Otherwise returns the ticket of the waiting request.
     fn put_paths(
         &mut self,
         now: Instant,
@@ -130,7 +131,7 @@ impl Simulator {
             barrier.put(robots.start, n_moves, own, is_full);
             paths = rest;
         }
-        // A request for several worlds includes all their held robots, so that none of these worlds waits.
+        // A request for several worlds includes all held robots of these worlds, so no path is missing.
         if worlds.len() > 1 || self.is_complete(now, worlds.start) {
             let parts = self.parts(request, payload);
             self.advance(now, worlds, Some(parts));
@@ -140,7 +141,7 @@ impl Simulator {
         Some(self.wait(now, client, request, worlds.start))
     }
 
-    /// Makes a request wait for the other paths of its world.
+    /// Makes a request wait until the other paths for its world's next step have arrived.
     fn wait(
         &mut self,
         now: Instant,
@@ -202,8 +203,8 @@ impl Simulator {
     }
 
     /// Checks that a request for one world includes all robots that its client holds there, and that a request for
-    /// several worlds includes all their held robots. Only the first and the last world can have robots outside the
-    /// request.
+    /// several worlds includes all held robots of these worlds. Looks only at the first and the last world, because the
+    /// robots of a request are consecutive.
     fn check_whole(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
         let (team, worlds) = (self.spec.rules.n_robots, self.worlds_of(robots));
         for world in [worlds.start, worlds.end - 1] {
@@ -220,7 +221,8 @@ impl Simulator {
         Ok(())
     }
 
-    /// Checks that no path of these robots is waiting. A client with two ports could otherwise send a second path.
+    /// Checks that none of these robots already has a path for the next step. A client with two ports could otherwise
+    /// send a second path.
     fn check_new(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
         for world in self.worlds_of(robots) {
             let own = within(robots, self.robots_of(world));
@@ -231,7 +233,7 @@ impl Simulator {
         Ok(())
     }
 
-    /// Checks that each world can step, and that the paths are meant for its current step.
+    /// Checks that each world can step, and that the paths start at its current step.
     fn check_ready(&self, robots: &Range<usize>, body: &[u8]) -> Result<(), Refusal> {
         for (world, step) in self.worlds_of(robots).zip(numbers(body)) {
             let Some(episode) = self.episode(world) else {

@@ -93,7 +93,7 @@ fn a_world_in_burn_in_refuses_steps_and_delays_other_requests() {
     let Some(Reply::Reset { worlds }) = simulator.pending_reply(now, &pending) else {
         panic!("expected a reset");
     };
-    // The reset has set the step back to 0.
+    // The reset has set the step to 0.
     assert_eq!(
         (worlds[0].seed, worlds[0].step, worlds[0].episode),
         (77, 0, 1)

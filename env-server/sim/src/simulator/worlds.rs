@@ -29,7 +29,8 @@ impl Simulator {
         encode(&self.spec.settings, &worlds)
     }
 
-    /// Starts a world from a snapshot. Returns the reset job if the saved world was still in its burn-in.
+    /// Starts a world with the state from a snapshot. Returns the reset job if the saved world was still in its
+    /// burn-in.
     pub fn start_with(
         &mut self,
         world: usize,
@@ -106,7 +107,7 @@ impl Simulator {
         self.restored(worlds.clone())
     }
 
-    /// Cancels the wait for a file that failed or whose client has stopped waiting.
+    /// Ends the wait of a request for a file, when the file job failed or the client has stopped waiting.
     pub fn cancel_file(&mut self, now: Instant, pending: &PendingFile) {
         if let PendingFile::Restored { lease, .. } = pending {
             self.leases.end_wait(now, *lease);
@@ -259,7 +260,7 @@ fn absolute(path: String) -> Result<PathBuf, Reply> {
     )))
 }
 
-/// Returns the answer to a snapshot request, which describes the worlds as they were written.
+/// Returns the answer to a snapshot request. It describes the worlds as they are in the file.
 fn saved(pending: &PendingFile, path: &Path, n_bytes: usize) -> Reply {
     let PendingFile::Saved(worlds) = pending else {
         return malformed("expected a pending snapshot, got a pending restore");

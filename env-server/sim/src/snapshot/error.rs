@@ -5,7 +5,7 @@ use thiserror::Error;
 /// The reason for refusing a snapshot: what was expected and what was found.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
-    /// The file is damaged. An older file may still be intact.
+    /// The file is damaged. The caller may try an older file, which may be intact.
     #[error("{0}")]
     Damaged(String),
     /// The snapshot has different settings, another version or invalid values.

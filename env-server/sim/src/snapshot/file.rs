@@ -1,4 +1,4 @@
-//! Snapshot files, which are written completely or not at all.
+//! Reads and writes snapshot files. A file is written completely or not at all.
 
 use super::error::SnapshotError;
 use super::format::{HEADER_BYTES, MAGIC, MAX_BYTES, Snapshot, checked_length, decode};
@@ -42,7 +42,7 @@ pub enum Durability {
 /// Writes a file, with mode 0600, under a temporary name and then renames it, so that it is never incomplete.
 pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), FileError> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
-    // Several threads of a process may write the same file.
+    // Makes the temporary name unique, because several threads of a process may write the same file.
     let n = N_PARTS.fetch_add(1, Ordering::Relaxed);
     name.push(format!(".{}-{n}{PART}", std::process::id()));
     let part = path.with_file_name(name);
@@ -62,12 +62,12 @@ pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), Fi
     })
 }
 
-/// Waits until the folder has reached the disk, so that the new name survives a loss of power.
+/// Waits until the folder's entries are on disk, so that the new file name survives a loss of power.
 fn sync_folder_of(path: &Path) -> io::Result<()> {
     let folder = path
         .parent()
         .filter(|folder| !folder.as_os_str().is_empty());
-    // Other systems cannot open folders.
+    // Only Unix can open folders.
     if cfg!(unix) {
         File::open(folder.unwrap_or(Path::new(".")))?.sync_all()?;
     }
@@ -90,7 +90,7 @@ pub fn refused(path: &Path, error: SnapshotError) -> FileError {
     }
 }
 
-/// Creates a new file. Anything else with this name, such as a link or a pipe, is removed without being opened.
+/// Creates a new file. Removes whatever already has this name, such as a link or a pipe, without opening it.
 pub(super) fn create(path: &Path) -> io::Result<File> {
     match std::fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
@@ -103,7 +103,7 @@ pub(super) fn create(path: &Path) -> io::Result<File> {
     options.open(path)
 }
 
-/// Checks that no file or a snapshot exists at the path. Other files, devices and links must not be replaced.
+/// Checks that either nothing or a snapshot exists at the path. Other files, devices and links must not be replaced.
 fn may_be_replaced(path: &Path) -> io::Result<()> {
     if path.file_name().is_none() {
         return Err(io::Error::other(NOT_A_FILE));
@@ -128,14 +128,14 @@ fn may_be_replaced(path: &Path) -> io::Result<()> {
 fn open(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.read(true);
-    // Without this flag, opening a pipe would wait for its writer.
+    // Without this flag, opening a pipe would block until another process opens it for writing.
     #[cfg(unix)]
     options.custom_flags(rustix::fs::OFlags::NONBLOCK.bits() as i32);
     options.open(path)
 }
 
-/// Reads a whole file after checking that it is a regular file of the length that its header states. A pipe would
-/// block, and a device might never end.
+/// Reads a whole file. First checks that it is a regular file, because reading a pipe could block and a device might
+/// never end, and that its length is the one stated in its header.
 fn read_bytes(path: &Path) -> io::Result<Result<Vec<u8>, SnapshotError>> {
     let mut file = open(path)?;
     let metadata = file.metadata()?;

@@ -11,7 +11,7 @@ const DIGITS: usize = 12;
 /// Ending of snapshot files in a folder.
 const EXTENSION: &str = "snapshot";
 
-/// A folder with the latest, numbered snapshots of an instance.
+/// A folder that contains the latest snapshots of an instance as numbered files.
 #[derive(Debug, Clone)]
 pub struct Folder {
     path: PathBuf,
@@ -19,7 +19,7 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// Represents an instance's snapshots in a folder. Does not read the folder.
+    /// Creates the handle for an instance's snapshots in a folder, without reading the folder.
     pub fn new(path: &Path, instance: &Instance) -> Self {
         Self {
             path: path.into(),
@@ -37,7 +37,8 @@ impl Folder {
         made.map_err(|error| failed(&self.path, error))
     }
 
-    /// Creates the error for a folder with snapshots of an earlier run, which new snapshots would gradually replace.
+    /// Creates the error for a folder that contains snapshots of an earlier run. A new run would gradually replace
+    /// them.
     pub fn not_empty(&self, n_files: usize) -> FileError {
         let instance = &self.instance;
         FileError {
@@ -101,8 +102,8 @@ impl Folder {
         names
     }
 
-    /// Writes the next file. Then removes all files except `also_keep` and the latest `keep` files, which include the
-    /// new one.
+    /// Writes the next file. Then removes all files except `also_keep` and the latest `keep` files (the new file is one
+    /// of these).
     pub fn save(
         &self,
         bytes: &[u8],

@@ -1,8 +1,8 @@
 //! The format of snapshots: everything that determines the worlds' future, with a version and a checksum.
 //!
 //! A file consists of [`MAGIC`], the version, the CRC-32 of the body, the length of the body, and the body:
-//! [`Settings`] and worlds, encoded by bincode. The byte order is the host's. A file in the other byte order appears to
-//! have an unknown version.
+//! [`Settings`] and worlds, encoded by bincode. The byte order is the host's. If a file has the other byte order, its
+//! version number is unknown, so it is refused.
 
 use super::error::SnapshotError;
 use super::settings::{Settings, WorldSpec};
@@ -39,11 +39,12 @@ pub struct Snapshot {
     pub worlds: Vec<SnapshotWorld<Box<SavedWorld>>>,
 }
 
-/// A world at some step, or an episode that is yet to be simulated.
+/// A saved world: either its state at some step, or only the seed and number of an episode whose burn-in had not
+/// finished.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum SnapshotWorld<T> {
     Ready(T),
-    /// A world in its burn-in.
+    /// A world that was in its burn-in.
     New(NewEpisode),
 }
 
@@ -66,7 +67,7 @@ struct EncodedWorld<'a> {
     history: Vec<Past<&'a [u8]>>,
 }
 
-/// A past step: the world's result, and the result, cells and values of each robot.
+/// A past step: the world's result, and for each robot its result, the observed cells and the observations.
 type Past<B> = (Vec<u8>, Vec<(Vec<u8>, B, B)>);
 
 /// A world decoded from a file, with the same fields as [`EncodedWorld`].
@@ -155,8 +156,8 @@ fn check_size(n_bytes: u64) -> Result<(), SnapshotError> {
 type Contents = (Settings, Vec<(u64, u64, Option<DecodedWorld>)>);
 
 /// Decodes a body, and returns the contents and the number of bytes read. Limits bincode's allocations, so that a small
-/// file cannot claim much memory. The limit is a constant in a type of bincode, so this function chooses the smallest
-/// sufficient constant.
+/// file cannot claim much memory. In bincode the limit is a const generic, so this function chooses the smallest of
+/// three limits that suffices.
 fn decode_body(body: &[u8]) -> Result<(Contents, usize), DecodeError> {
     match body.len() {
         0..0x1_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x10_0000>()),
@@ -257,7 +258,7 @@ impl<'a> EncodedWorld<'a> {
 }
 
 impl Snapshot {
-    /// Checks the settings and values, and returns the worlds, ready to continue on a server.
+    /// Checks the settings and all values, and converts the saved worlds to worlds that can continue on a server.
     pub fn restore(
         self,
         spec: &WorldSpec,

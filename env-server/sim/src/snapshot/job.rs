@@ -20,11 +20,11 @@ pub enum Job {
         durability: Durability,
         /// Number of files to keep.
         keep: usize,
-        /// Another file to keep.
+        /// A further file to keep.
         also_keep: Option<PathBuf>,
         bytes: Vec<u8>,
     },
-    /// Reads worlds from a snapshot.
+    /// Reads the worlds in this range from a snapshot.
     Load { path: PathBuf, worlds: Range<usize> },
 }
 

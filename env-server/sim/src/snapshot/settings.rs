@@ -1,4 +1,4 @@
-//! The settings that a server's worlds depend on. A snapshot fits a server with equal settings.
+//! The settings on which a server's worlds depend. A snapshot can be restored on a server for which these are equal.
 
 use super::error::SnapshotError;
 use crate::config::Checked;
@@ -8,13 +8,15 @@ use emberwatch_model::ModelError;
 use sha2::{Digest, Sha256};
 use std::fmt::Display;
 
-/// Key of the task's name. This setting comes last, and only if a task determines the worlds' settings.
+/// Key of the setting that contains the task's name. It is the last setting, and exists only if a task determines the
+/// worlds' settings.
 const TASK: &str = "task";
 
-/// Version of the dynamics. Increased when equal settings and seeds yield a different trajectory or different rewards.
+/// Version of the simulation. It is increased whenever a change to the code makes the same settings and seed give
+/// another trajectory or other rewards.
 const WORLDS: u32 = 1;
 
-/// The settings of a server that its worlds depend on.
+/// The settings of a server on which its worlds depend.
 #[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
 pub struct Settings {
     /// The model file as TOML.
@@ -23,7 +25,7 @@ pub struct Settings {
     pub others: Vec<(String, String)>,
 }
 
-/// The settings and rules that the worlds of a server must fit.
+/// The settings and rules of a server's worlds, which restored worlds must fit.
 #[derive(Debug, Clone)]
 pub struct WorldSpec {
     pub settings: Settings,
@@ -58,7 +60,7 @@ impl WorldSpec {
 }
 
 impl Settings {
-    /// Extracts the settings that worlds depend on.
+    /// Extracts the settings on which worlds depend.
     pub fn of(checked: &Checked) -> Self {
         let config = &checked.config;
         let model = toml::to_string(checked.model.file());
@@ -93,12 +95,13 @@ impl Settings {
     /// Returns 16 hexadecimal digits that identify the worlds. Results are comparable only if these digits are equal.
     ///
     /// The hash covers the model or the recorded states, grid, moves, robots, start, burn-in and whether robots see
-    /// every cell. It omits the task's name and `max_steps`, because each result states its number of steps.
+    /// every cell. It omits the task's name, and `max_steps`, because each result states its own number of steps.
     pub fn worlds_fingerprint(&self) -> String {
         let mut hash = Sha256::new();
         hash.update(format!("worlds {WORLDS}\n{}\n", self.model));
         for (name, value) in &self.others {
-            // With `client`, robots see the cells of their path unless the client asks for more.
+            // `client` counts as `path`, because robots then see the cells of their path unless the client asks for
+            // more.
             let value = if value == "client" { "path" } else { value };
             if name != TASK && name != "max_steps" {
                 hash.update(format!("{name} = {value}\n"));
@@ -127,7 +130,7 @@ impl Settings {
                 &format!("{:?}", start_of(got)),
             ));
         }
-        // The task's name is not compared: equal settings may come from a task or from flags.
+        // The task's name is not compared, because the same settings may come from a task or from flags.
         let others = server.others.iter().filter(|(name, _)| name != TASK);
         for (index, (setting, expected)) in others.enumerate() {
             let got = self

@@ -100,13 +100,13 @@ fn every_truncation_and_every_changed_byte_is_detected() {
     assert_eq!(refusal(header, &longer), words);
     let words = "malformed: 1 bytes after the last world";
     assert_eq!(sealed(&longer), words);
-    // The header claims a length that exceeds any memory.
+    // The first length in the body exceeds any memory.
     let claims = [&u64::MAX.to_ne_bytes(), &body[8..]].concat();
     let said = sealed(&claims);
     assert!(said.starts_with("malformed: "), "{said}");
 }
 
-/// Builds an array of changes to a world and the error for each.
+/// Builds an array of pairs: a change to a world, and the resulting error.
 macro_rules! changes {
     ($world:ident: $($change:block $words:literal)*) => {
         &[$((|$world| $change, $words)),*]

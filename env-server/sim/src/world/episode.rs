@@ -1,7 +1,7 @@
 //! One world with its robots: reset, step, reward, truncation.
 //!
-//! A step flies the paths, moves the world from X_k to X_{k+1}, and observes the visited cells of X_{k+1} (paper
-//! Algorithm 1, in the authors' order).
+//! In a step, the robots fly their paths, the world moves from X_k to X_{k+1}, and the visited cells of X_{k+1} are
+//! observed. This is paper Algorithm 1, in the order of the authors' code.
 
 use super::flown::Flown;
 use super::hidden::World;
@@ -19,11 +19,11 @@ use emberwatch_model::{Coverage, Frame, Grid};
 #[derive(Debug, Clone)]
 pub struct Episode {
     world: World,
-    /// The world at k = 0, so that a reset to the same seed needs no burn-in.
+    /// A copy of the world at k = 0, so that a reset to the same seed needs no burn-in.
     beginning: World,
     robots: Vec<Robot>,
     outcome: WorldOutcome,
-    /// A buffer for [`pay`], which is 0 for each cell between calls.
+    /// A buffer for [`pay`] with one count per cell. All counts are 0 between calls.
     counts: Vec<u8>,
     scratch: Scratch,
     history: History,
@@ -130,7 +130,7 @@ impl Episode {
         self.history.all()
     }
 
-    /// Restores a saved episode. It continues exactly as the original does, bit for bit.
+    /// Restores a saved episode. The restored episode continues exactly as the original, bit for bit.
     pub fn restore(rules: &Rules, saved: SavedWorld) -> Result<Self, InvalidWorld> {
         saved.check(rules)?;
         let SavedWorld {
@@ -219,7 +219,7 @@ fn restored(rules: &Rules, saved: &SavedRobot) -> Result<Robot, InvalidWorld> {
 }
 
 fn count(states: &Grid<u8>, wanted: u8) -> u32 {
-    // Sums of up to 255 bytes cannot overflow a byte, and the compiler vectorises them.
+    // Counts in chunks of 255 cells, because their count fits a byte and the compiler can then vectorise the sum.
     let states = states.as_slice().expect("invariant: states are row-major");
     let of_chunk = |chunk: &[u8]| {
         u32::from(
@@ -299,7 +299,7 @@ mod tests {
         let cells: Vec<usize> = masked.observed().map(|(cell, _)| cell).collect();
         assert_eq!(cells, [20, 21, 22]);
         assert_eq!(full.observed().count(), 240);
-        // The path changes neither the readings of its cells nor the states.
+        // Neither the path nor full coverage changes the readings of these cells or the states.
         for (cell, value) in masked.observed() {
             assert_eq!(full.as_bytes()[cell], value);
         }

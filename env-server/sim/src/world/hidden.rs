@@ -1,8 +1,8 @@
 //! The hidden states of one world: a pure function of (model or recorded sequences, seed, k).
 //!
-//! A simulated world starts from the model's initial distribution and runs `burn_in` steps, which lead to k = 0. Its
-//! absolute step `burn_in + k` indexes the random streams, so that a world with burn-in B at step k equals a world
-//! without burn-in at step B + k.
+//! A simulated world starts from the model's initial distribution and runs `burn_in` steps, which lead to k = 0. The
+//! absolute step `burn_in + k` selects the random streams. So a world with a burn-in of B steps at step k equals a
+//! world without a burn-in at step B + k.
 
 use super::recorded::Recorded;
 use emberwatch_model::{Dynamics, Grid};
@@ -27,7 +27,7 @@ pub struct World {
 }
 
 impl Source {
-    /// Returns the last step of a seed's episode, if the source limits it.
+    /// Returns the last step of the episode with this seed, or `None` if the source does not limit its length.
     pub(super) fn last_step(&self, seed: u64) -> Option<u64> {
         match self {
             Self::Simulated(_) => None,
@@ -63,7 +63,8 @@ impl World {
         }
     }
 
-    /// Moves the world from k to k + 1: draws each cell's next state from `Phi` of the current states (paper eq. 4).
+    /// Moves the world from k to k + 1: draws each cell's next state from the distribution `Phi`, given the current
+    /// states (paper eq. 4).
     ///
     /// # Panics
     /// If a recorded sequence has ended.

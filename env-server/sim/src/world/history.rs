@@ -5,7 +5,7 @@ use super::robot::Robot;
 use emberwatch_model::{Cell, Coverage};
 use std::collections::VecDeque;
 
-/// Minimum capacity of a world's history, in bytes. It leaves space for frames with full coverage.
+/// Minimum capacity of a world's history, in bytes. It leaves space for frames with full coverage, which are larger.
 pub const MIN_HISTORY_BYTES: usize = 1 << 20;
 
 /// The frames of consecutive steps up to the current one, bounded in steps and in bytes.
@@ -18,7 +18,8 @@ pub struct History {
     steps: VecDeque<PastStep>,
 }
 
-/// Returns the size in bytes of `n_steps` steps, in which each of `n_robots` paths shows up to `most_seen` cells.
+/// Returns the size in bytes of a history of `n_steps` steps, in each of which each of `n_robots` robots observes up to
+/// `most_seen` cells.
 pub fn bytes_of_history(n_steps: usize, n_robots: usize, most_seen: usize) -> usize {
     let of_robot = size_of::<PastRobot>() + 5 * most_seen;
     let of_step = size_of::<PastStep>() + n_robots * of_robot;
@@ -46,8 +47,8 @@ pub struct PastRobot {
 }
 
 impl History {
-    /// Creates a history for `n_steps` steps (at least one), in which each of `n_robots` paths shows up to `most_seen`
-    /// cells.
+    /// Creates a history for `n_steps` steps (at least one), in each of which each of `n_robots` robots observes up to
+    /// `most_seen` cells.
     pub fn new(n_steps: usize, n_robots: usize, most_seen: usize) -> Self {
         let n_steps = n_steps.max(1);
         Self {
@@ -81,7 +82,8 @@ impl History {
         }
     }
 
-    /// Removes and returns the oldest step if the history has its maximum number of steps, to reuse its buffers.
+    /// If the history has its maximum number of steps, removes and returns the oldest step, whose buffers the caller
+    /// reuses.
     fn evict_if_full(&mut self) -> Option<PastStep> {
         (self.steps.len() >= self.n_steps).then(|| self.forget())?
     }
@@ -118,7 +120,7 @@ impl PastStep {
 }
 
 impl PastRobot {
-    /// Creates an empty entry, whose buffers [`Self::set`] fills.
+    /// Creates an entry with empty buffers, to be filled by [`Self::set`].
     fn blank() -> Self {
         Self {
             outcome: RobotOutcome::at(Cell { row: 0, col: 0 }),
@@ -145,8 +147,9 @@ impl PastRobot {
         self.values.extend(seen.map(|it| bytes[it.cell]));
     }
 
-    /// Writes the observations into `frame`, one byte per cell. Unobserved cells keep their value. If `frame` already
-    /// contains an observation of a cell, the smaller value is kept, because it comes from the inner sensor ring.
+    /// Writes the observations into `frame`, one byte per cell. Cells that this robot did not observe keep their value.
+    /// If `frame` already contains an observation of a cell, the smaller value is kept, because it comes from the inner
+    /// sensor ring.
     pub fn write_over(&self, frame: &mut [u8]) {
         if self.cells.is_empty() && !self.values.is_empty() {
             frame.copy_from_slice(&self.values);

@@ -11,18 +11,18 @@ pub struct WorldOutcome {
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of the rewards of the distinct rewarded cells, which depend on the cells' states in X_{k+1}.
+    /// Sum of the rewards of the distinct rewarded cells. A cell's reward depends on its state in X_{k+1}.
     pub reward: f64,
     /// Bit r is set if no client held robot r. Such a robot stays in its cell and observes nothing.
     pub hovered: u64,
     /// Bit r is set if robot r was held but its path missed the deadline. Such a robot stays in its cell and observes
     /// nothing.
     pub late: u64,
-    /// Number of cells of the whole grid in the state with the highest reward.
+    /// Number of cells in the whole grid whose state has the highest reward.
     pub n_target_cells: u32,
     /// Number of distinct cells that the robots visited.
     pub n_visited: u32,
-    /// Number of distinct rewarded cells in the state with the highest reward.
+    /// Number of distinct rewarded cells whose state has the highest reward.
     pub n_hits: u32,
     /// Whether the episode reached a terminal state.
     pub is_terminated: bool,
@@ -35,13 +35,13 @@ pub struct WorldOutcome {
 pub struct RobotOutcome {
     /// The robot's share of the world's reward: each of v robots that visited a cell gets 1/v of the cell's reward.
     pub reward: f64,
-    /// Marginal reward: the decrease of the world's reward if this robot had not flown.
+    /// Marginal reward: how much smaller the world's reward would be if this robot had not flown.
     pub marginal: f64,
     /// Number of distinct cells that the robot visited.
     pub n_visited: u32,
-    /// Number of the robot's distinct rewarded cells in the state with the highest reward.
+    /// Number of the robot's distinct rewarded cells whose state has the highest reward.
     pub n_hits: u32,
-    /// The first cell of its path, or the cell where it stayed.
+    /// The cell where the robot's path started, or where the robot stayed.
     pub start: Cell,
     /// The robot's current cell.
     pub cell: Cell,

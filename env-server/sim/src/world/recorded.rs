@@ -1,4 +1,5 @@
-//! Recorded hidden states. A world's seed selects the sequence, its symmetry and its first recorded step.
+//! Recorded hidden states. A world's seed selects a sequence, the symmetry applied to it, and the recorded step at
+//! which the episode begins.
 
 use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_model::{Grid, Shape};
@@ -12,11 +13,11 @@ pub struct Recorded {
     sequences: Vec<Array3<u8>>,
     shape: Shape,
     with_symmetries: bool,
-    /// Maximum recorded step at which an episode begins.
+    /// The latest recorded step at which an episode may begin.
     most_offset: u64,
 }
 
-/// A seed's selection from the recorded states.
+/// What a seed selects from the recorded states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Choice {
     sequence: usize,
@@ -65,7 +66,7 @@ impl Recorded {
         self.shortest() - 1 - self.most_offset
     }
 
-    /// Returns the last step of a seed's episode.
+    /// Returns the last step of the episode with this seed.
     pub(super) fn last_step(&self, seed: u64) -> u64 {
         let Choice {
             sequence, offset, ..
@@ -73,7 +74,7 @@ impl Recorded {
         self.sequences[sequence].len_of(Axis(0)) as u64 - 1 - offset
     }
 
-    /// Returns the hidden states at a step of a seed's episode, shape `[H, W]`.
+    /// Returns the hidden states at a step of the episode with this seed, shape `[H, W]`.
     pub(super) fn states(&self, seed: u64, step: u64) -> Grid<u8> {
         let mut states = Grid::zeros(self.shape.dim());
         self.show(seed, step, &mut states);
@@ -114,7 +115,8 @@ impl Recorded {
     }
 }
 
-/// Applies a symmetry of the square: bit 2 transposes, then bit 0 reverses the rows and bit 1 the columns.
+/// Applies a symmetry of the square, given as three bits. Bit 2 transposes the grid. Then bit 0 reverses the order of
+/// the rows, and bit 1 that of the columns.
 fn turned(states: ArrayView2<'_, u8>, symmetry: u64) -> ArrayView2<'_, u8> {
     let mut turned = match symmetry & 4 {
         0 => states,
@@ -193,7 +195,8 @@ mod tests {
             let first = recorded.states(seed, 0)[[0, 0]];
             assert_eq!(u64::from(first), 50 * sequence as u64 + 10 * offset);
         }
-        // 4,000 independent draws of 4 values. Each check exceeds 4.5 standard errors in 1 of 150,000 runs.
+        // 4,000 independent draws of 4 values. By chance, a count deviates by more than 4.5 standard errors in 1 of
+        // 150,000 runs.
         let bound = 4.5 * (4000.0_f64 * 0.25 * 0.75).sqrt();
         let is_likely = |count: &f64| (count - 1000.0).abs() < bound;
         assert!(counts.iter().all(is_likely), "{counts:?}");

@@ -1,16 +1,16 @@
-//! The rewards of a step. A cell that several robots visit counts once. Under `Pays::Seen`, the cells that robots see
-//! count instead.
+//! The rewards of a step. Visited cells yield rewards, and a cell that several robots visit counts once. With
+//! `Pays::Seen`, the cells that robots see yield rewards instead.
 
 use super::outcome::WorldOutcome;
 use super::robot::Robot;
 use super::rules::Rules;
 use emberwatch_model::Pays;
 
-/// Flag in a cell's count, set once the team has received the cell's reward.
+/// Flag in a cell's count. It is set when the cell's reward has been added to the team's total.
 const PAID: u8 = 0x80;
 
 /// Computes the rewards of a step from `states`, X_{k+1}: each robot's share and marginal reward, and the team's total.
-/// `counts` must be 0 for each cell, and is 0 again on return.
+/// All `counts` must be 0, and they are 0 again on return.
 pub(super) fn pay(
     rules: &Rules,
     states: &[u8],

@@ -25,7 +25,7 @@ pub struct Scratch {
     rings: Vec<u8>,
 }
 
-/// Returns the memory of a robot and its next path, in bytes. The robot sees up to `most_seen` of `n_cells` cells.
+/// Returns the memory in bytes of a robot with its next path, if the robot sees up to `most_seen` of `n_cells` cells.
 pub fn bytes_of_robot(n_moves: usize, most_seen: usize, n_cells: usize) -> usize {
     let of_path = n_moves * (2 * size_of::<Move>() + size_of::<usize>());
     let of_sight = most_seen * (size_of::<SeenCell>() + size_of::<usize>());
@@ -33,7 +33,7 @@ pub fn bytes_of_robot(n_moves: usize, most_seen: usize, n_cells: usize) -> usize
 }
 
 impl Robot {
-    /// Creates a robot in the state after a reset.
+    /// Creates a robot at a cell, in its state after a reset.
     pub(super) fn at(airspace: &Airspace, cell: Cell) -> Self {
         let mut robot = Self {
             outcome: RobotOutcome::at(cell),
@@ -47,7 +47,7 @@ impl Robot {
         robot
     }
 
-    /// Flies a path, or stays if the path is empty. The caller then writes the frame and the rewards.
+    /// Flies a path, or stays if the path is empty. The caller must then set the frame and the rewards.
     pub(super) fn fly(
         &mut self,
         airspace: &Airspace,

@@ -18,9 +18,9 @@ use std::sync::atomic::AtomicBool;
 pub struct Rules {
     pub shape: Shape,
     pub airspace: Airspace,
-    /// Row-major indices of the possible random starts, or `None` if every cell is possible.
+    /// Row-major indices of the cells from which random starts are drawn, or `None` for all cells.
     starts: Option<Arc<Vec<usize>>>,
-    /// Reward of a distinct visited (or seen) cell, by the cell's state.
+    /// Reward of a distinct visited (or seen) cell, indexed by the cell's state.
     pub reward: Vec<f64>,
     /// The state with the highest reward.
     pub target_state: u8,
@@ -33,20 +33,21 @@ pub struct Rules {
     /// Episode length in steps. If it is 0, episodes are never truncated.
     pub max_steps: u64,
     pub start: Start,
-    /// Number of steps whose frames are kept.
+    /// Number of past steps whose frames are kept.
     pub history: usize,
     /// Number of moves in a path.
     pub n_moves: usize,
     /// Number of robots per world.
     pub n_robots: usize,
-    /// Set when the worlds are no longer needed. Running burn-ins then stop at once, and their worlds must not be used.
+    /// Set when the worlds are no longer needed. Running burn-ins then stop at once, and the unfinished worlds must not
+    /// be used.
     pub ended: Arc<AtomicBool>,
     pub(super) sensor: Sensor,
     pub(super) source: Source,
 }
 
 impl Rules {
-    /// Creates the rules of a model for one robot, with `history` and `n_moves` set to 0.
+    /// Creates the rules for worlds of this model with one robot. Leaves `history` and `n_moves` at 0.
     pub fn new(
         model: &Model,
         shape: Shape,
@@ -81,7 +82,7 @@ impl Rules {
         self
     }
 
-    /// Returns whether the episode of a seed is truncated at a step.
+    /// Returns whether the episode with this seed is truncated at a step.
     pub(super) fn truncates(&self, seed: u64, step: u64) -> bool {
         let last = self.source.last_step(seed);
         (self.max_steps > 0 && step >= self.max_steps) || last.is_some_and(|last| step >= last)
@@ -104,7 +105,7 @@ impl Rules {
     }
 }
 
-/// Returns the maximum number of cells that a robot with a sensor of this radius sees from a path.
+/// Returns the maximum number of cells that a robot with a sensor of this radius sees along a path.
 pub fn most_seen(radius: usize, n_moves: usize, n_cells: usize) -> usize {
     match radius {
         0 => n_moves,

@@ -1,4 +1,4 @@
-//! Worlds read from a file, and the checks on which an episode relies.
+//! Worlds read from a file, and the checks that their values are valid for an episode.
 
 use super::history::{PastRobot, PastStep};
 use super::outcome::{RobotOutcome, WorldOutcome};
@@ -39,7 +39,7 @@ pub struct SavedRobot {
 pub struct InvalidWorld(pub String);
 
 impl SavedWorld {
-    /// Checks every value on which an episode relies.
+    /// Checks that every value is valid for an episode.
     pub fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
         let n_cells = rules.shape.n_cells();
         for (what, states) in [

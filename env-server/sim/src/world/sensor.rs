@@ -1,8 +1,8 @@
 //! Observation noise: draws a sensor's reading of each observed cell (paper eq. 1).
 //!
 //! A reading is a pure function of (seed, step, cell, ring), so two agents that observe the same cell in the same step
-//! and ring get the same reading. One ChaCha8 draw gives the key of the step. SplitMix64 with this key generates each
-//! cell's random number. The cost is constant per observed cell, and zero for other cells.
+//! and ring get the same reading. One ChaCha8 draw gives a key for the step, and SplitMix64 with this key generates
+//! each cell's random number. So the cost is constant per observed cell, and other cells cost nothing.
 
 use emberwatch_model::SeenCell;
 use emberwatch_model::randomness::{Purpose, split_mix, stream};
@@ -12,7 +12,8 @@ use rand_chacha::rand_core::Rng;
 /// The observation probabilities `P(y | x)` as thresholds on a 32-bit random number.
 #[derive(Debug, Clone)]
 pub struct Sensor {
-    /// `thresholds[(x * n_rings + ring) * n_named + y]` is the upper end of `y`'s share of the 2^32 numbers.
+    /// `thresholds[(x * n_rings + ring) * n_named + y]` is the upper end of the interval of 32-bit numbers that give
+    /// observation `y` in state `x`.
     thresholds: Vec<u64>,
     n_rings: usize,
     /// Number of observations per ring.
@@ -32,7 +33,7 @@ impl Sensor {
                     (sum * 2f64.powi(32)).round() as u64
                 })
                 .collect();
-            // Despite rounding, every number must map to an observation.
+            // The last threshold is 2^32, so that every number maps to an observation despite rounding.
             let last = row.iter().rposition(|p| *p > 0.0).unwrap_or(row.len() - 1);
             thresholds[last..].fill(1 << 32);
             thresholds
@@ -47,7 +48,7 @@ impl Sensor {
         }
     }
 
-    /// Returns the key of all readings in one step of a world.
+    /// Returns the key that generates all readings in one step of a world.
     pub fn key(seed: u64, absolute_step: u64) -> u64 {
         stream(seed, Purpose::Sensor, absolute_step).next_u64()
     }
@@ -65,8 +66,8 @@ impl Sensor {
             let number = split_mix(key, cell as u64) >> 32;
             let row = usize::from(states[cell]) * self.n_rings + usize::from(ring);
             let of_state = &self.thresholds[row * self.n_named..][..self.n_named];
-            // Counts over all thresholds, because a loop that stops early would mispredict a branch at every latent
-            // cell.
+            // Compares with all thresholds, because a loop that stops early would cause a branch misprediction at every
+            // latent cell.
             let passed = of_state.iter().filter(|threshold| number >= **threshold);
             let reading = passed.count() + usize::from(ring) * self.n_named;
             frame.observe(cell, reading as u8);
@@ -74,7 +75,7 @@ impl Sensor {
     }
 }
 
-/// Returns cells of the path itself, which lie in ring 0.
+/// Converts cells on the path to seen cells, which lie in ring 0.
 pub(super) fn path_cells(cells: impl Iterator<Item = usize>) -> impl Iterator<Item = SeenCell> {
     cells.map(|cell| SeenCell { cell, ring: 0 })
 }
@@ -113,7 +114,8 @@ mod tests {
             }
             let n = 20.0 * 10_000.0;
             for (count, &p) in counts.iter().zip(expected) {
-                // 200,000 independent draws. Each of the 9 checks exceeds 4.5 standard errors in 1 of 150,000 runs.
+                // 200,000 independent draws. By chance, each of the 9 counts deviates by more than 4.5 standard errors
+                // in 1 of 150,000 runs.
                 let bound = 4.5 * (p * (1.0 - p) / n).sqrt();
                 assert!((count / n - p).abs() < bound, "state {state}: {counts:?}");
             }

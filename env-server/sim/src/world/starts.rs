@@ -6,12 +6,12 @@ use emberwatch_model::{Airspace, Cell, Shape};
 use std::collections::BTreeSet;
 use std::fmt::{Display, Formatter};
 
-/// The free cells that the robots of a world can reach despite no-fly cells.
+/// The number of free cells, and of those that robots cannot reach because of no-fly cells.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Reach {
     /// Number of free cells.
     pub n_free: usize,
-    /// Number of free cells outside the largest connected part. Random starts lie only in that part.
+    /// Number of free cells outside the largest connected part. Random starts lie only inside that part.
     pub n_cut_off: usize,
     /// The fixed starts outside the largest connected part.
     pub closed_in: Vec<ClosedIn>,
@@ -71,7 +71,7 @@ impl Reach {
         })
     }
 
-    /// Describes the share of the free cells that random starts cannot reach. Returns `None` if they reach all.
+    /// Describes the share of free cells that robots with random starts cannot reach. Returns `None` if they reach all.
     pub fn cut_off(&self) -> Option<String> {
         let Self {
             n_free, n_cut_off, ..
@@ -101,7 +101,7 @@ impl Display for ClosedIn {
     }
 }
 
-/// Returns the row-major indices of the possible random starts, or `None` if these are all cells of the grid.
+/// Returns the row-major indices of the cells from which random starts are drawn, or `None` for all cells of the grid.
 pub(super) fn random_starts(airspace: &Airspace) -> Option<Vec<usize>> {
     (!airspace.is_open()).then(|| Parts::of(airspace).starts())
 }
@@ -116,7 +116,7 @@ pub(super) fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Ce
     }
 }
 
-/// Returns a corner or the middle of a side. These cells differ between the first eight robots.
+/// Returns a corner of the grid or the middle of a side. The first eight robots get different cells.
 fn corner_or_side(shape: Shape, robot: usize) -> Cell {
     let (bottom, right) = (shape.height() - 1, shape.width() - 1);
     let places = [

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 /// Values of at least this mean "no limit": version 1 writes the largest multiple of the page size.
 const UNLIMITED: u64 = 1 << 60;
 
-/// A controller of cgroups. Its files have one name in version 1 and another in version 2.
+/// A cgroup controller, such as `memory`. Each of its files has one name in version 1 and another in version 2.
 pub(super) struct Controller {
     pub(super) name: &'static str,
     /// The file with the limit of the cgroup.
@@ -33,7 +33,7 @@ struct Mount {
     folder: PathBuf,
 }
 
-/// Returns the limits of a controller on this process, from the files below `root`.
+/// Returns the limits that a controller sets for this process, read from the files below `root`.
 pub(super) fn limits(root: &Path, controller: &Controller) -> Vec<CgroupLimit> {
     let read = |path: &str| std::fs::read_to_string(root.join(path)).unwrap_or_default();
     let (own, mounts) = (read("proc/self/cgroup"), read("proc/self/mountinfo"));
@@ -69,8 +69,8 @@ fn mount(line: &str, controller: &Controller) -> Option<Mount> {
     })
 }
 
-/// Returns the cgroup of this process, relative to the top of a mount, from the lines of `/proc/self/cgroup`. A line is
-/// `4:memory:/docker/id` or, in version 2, `0::/user.slice`.
+/// Returns the cgroup of this process, relative to the top of a mount, from the lines of `/proc/self/cgroup`. A line
+/// is, for example, `4:memory:/docker/id` or, in version 2, `0::/user.slice`.
 fn own_group(own: &str, mount: &Mount, controller: &Controller) -> Option<PathBuf> {
     let path = own.lines().find_map(|line| {
         let mut words = line.splitn(3, ':').skip(1);
@@ -125,9 +125,9 @@ mod tests {
         reclaimable: [&["total_inactive_file"], &["inactive_file"]],
     };
 
-    /// Checks the limits found in a system with these files. Each line of `files` is one file, with `;` at the end of
-    /// its lines. Each expected limit consists of the folder, the limit and the free amount, from the innermost cgroup
-    /// outward.
+    /// Checks the limits found in a system with these files. Each line of `files` describes one file, whose own lines
+    /// end with `;`. Each expected limit consists of the folder, the limit and the free amount, from the innermost
+    /// cgroup outward.
     fn check(name: &str, files: &str, expected: &[&str]) {
         let root = std::env::temp_dir().join(format!("emberwatch-{name}-{}", std::process::id()));
         for line in files.trim().lines() {
@@ -159,7 +159,8 @@ mod tests {
         check("v2", &format!("{outer}max;"), &[expected]);
         let inner = "sys/fs/cgroup/outer/inner 600 100";
         check("v2-both", &format!("{outer}600;"), &[inner, expected]);
-        // In a separate namespace, a process sees its group as the top, or its parent as "..".
+        // In a separate cgroup namespace, a process sees its cgroup as the root, or a cgroup outside the namespace with
+        // a path that begins with "..".
         for own in ["0::/", "0::/../other"] {
             let top = format!(
                 "proc/self/cgroup = {own}

@@ -41,7 +41,7 @@ struct Limit {
 /// If the machine, a cgroup or a `ulimit` has less memory.
 pub fn check(what: impl Display, n_bytes: u64) -> Result<(), NoMemory> {
     check_below(Path::new("/"), &what, n_bytes)?;
-    // Some limits appear in no file, such as those of an overcommitted system.
+    // Some limits appear in no file, such as the limit on overcommitted memory.
     let mut probe = Vec::<u8>::new();
     let reserved = usize::try_from(n_bytes).map(|n_bytes| probe.try_reserve_exact(n_bytes));
     match reserved {
@@ -117,7 +117,7 @@ fn of_machine(root: &Path) -> Option<Limit> {
     })
 }
 
-/// Returns no limits: outside Linux, limits of `ulimit`, cgroups and `/proc` are unknown.
+/// Returns no limits, because the limits of `ulimit`, cgroups and `/proc` are unknown outside Linux.
 #[cfg(not(target_os = "linux"))]
 fn of_process(_root: &Path) -> Vec<Limit> {
     Vec::new()
@@ -144,7 +144,7 @@ fn of_process(root: &Path) -> Vec<Limit> {
     kinds.into_iter().filter_map(limit).collect()
 }
 
-/// Returns the number of bytes in a line such as `MemTotal:  1024 kB`.
+/// Parses the number of bytes from a line such as `MemTotal:  1024 kB`.
 fn kib(text: &str, name: &str) -> Option<u64> {
     let line = text.lines().find_map(|line| line.strip_prefix(name))?;
     let number = line.trim().strip_suffix(" kB")?.parse::<u64>().ok()?;

@@ -1,4 +1,4 @@
-//! Errors for threads that the system does not start. They name the limit that prevents this.
+//! Errors for threads that the system does not start. Each error names the limit that was reached.
 
 use super::cgroups::{self, Controller};
 use super::memory;
@@ -17,7 +17,7 @@ const CGROUP: Controller = Controller {
 /// Address space of a thread in bytes: its stack of 2 MiB, and the C library's data for it.
 const THREAD_BYTES: u64 = 4 << 20;
 
-/// The advice if the container forbids `clone3` in a way that keeps the C library from falling back on another call.
+/// The advice if the container forbids `clone3` in a way that prevents the C library from falling back to another call.
 const REFUSED: &str = "the seccomp profile of the container forbids `clone3`; allow it, or let it fail with ENOSYS (Docker \
                        does since 20.10.10; --security-opt seccomp=PROFILE)";
 
@@ -45,9 +45,9 @@ pub fn spawn<T: Send + 'static>(
 }
 
 impl NoThreads {
-    /// Makes the error for `n_threads` threads that could not be started. Looks for the limit that prevents this.
+    /// Makes the error for `n_threads` threads that could not be started. Looks for the limit that was reached.
     pub fn new(n_threads: usize, error: &(dyn Error + 'static)) -> Self {
-        // A thread pool's error repeats the system's error.
+        // The error of a thread pool wraps the system's error.
         let error = error.source().unwrap_or(error);
         let kind = error.downcast_ref().map(std::io::Error::kind);
         Self {

@@ -16,11 +16,13 @@ pub const MAGIC: [u8; 8] = *b"EMBERREC";
 /// Version of the format. A file in the other byte order has a different value here, and is rejected.
 pub const VERSION: u32 = 2;
 
-/// Maximum size of a body before compression in bytes: the largest frames and the longest paths of the largest team.
+/// Maximum size of a body before compression in bytes, enough for the largest team with the largest frames and the
+/// longest paths.
 pub const MAX_BODY_BYTES: usize =
     size_of::<FrameHeader>() + MAX_TEAM_CELLS + MAX_ROBOTS * (ROBOT_BYTES + MAX_MOVES);
 
-/// Maximum size of a stored body in bytes: deflate may enlarge a body that it cannot compress.
+/// Maximum size of a stored body in bytes. It exceeds [`MAX_BODY_BYTES`], because deflate may enlarge a body that it
+/// cannot compress.
 pub const MAX_STORED_BYTES: usize = MAX_BODY_BYTES + MAX_BODY_BYTES / 1024 + 64;
 
 /// The header of a file.
@@ -39,13 +41,13 @@ pub struct FileHeader {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct RecordHeader {
-    /// Time since the recording began in nanoseconds; never less than in the previous record.
+    /// Time in nanoseconds since the recording began; never less than in the previous record.
     pub nanos: u64,
     /// A [`Kind`].
     pub kind: u32,
     /// Size of the stored body in bytes.
     pub length: u32,
-    /// Number of the channel's samples that the recorder missed directly before this one.
+    /// Number of samples of the same channel that the recorder missed directly before this record.
     pub n_lost: u32,
     /// CRC-32 of the first 20 bytes of this header and the stored body.
     pub checksum: u32,
@@ -55,7 +57,7 @@ pub struct RecordHeader {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Kind {
-    /// The server of the samples that follow: its [`ServerInfo`] in JSON.
+    /// The server that published the following samples: its [`ServerInfo`] in JSON.
     Server = 1,
     /// A sample of `frames`: header and payload.
     Frame = 2,
@@ -68,9 +70,10 @@ pub enum Kind {
 /// A checked record.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
-    /// Time since the recording began in nanoseconds; never less than in the previous record.
+    /// Time in nanoseconds since the recording began; never less than in the previous record.
     pub nanos: u64,
-    /// Number of the channel's samples that the recorder missed directly before this one; 0 for a server.
+    /// Number of samples of the same channel that the recorder missed directly before this record; 0 if the record is a
+    /// server.
     pub n_lost: u32,
     /// The content of the record.
     pub event: Event,
@@ -79,7 +82,7 @@ pub struct Record {
 /// The content of a record.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
-    /// The server of the samples that follow.
+    /// The server that published the following samples.
     Server(Box<ServerInfo>),
     /// The frames of a world's robots, and the paths that they flew.
     Frame(Sample<FrameHeader>),
@@ -87,7 +90,7 @@ pub enum Event {
     Truth(Sample<TruthHeader>),
 }
 
-/// The numbers of records in a recording, and of samples that its recorder missed.
+/// Counts of the records in a recording, and of the samples that its recorder missed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Totals {
     /// Number of servers.
@@ -112,7 +115,7 @@ pub enum RecordingError {
     /// The file is not a recording, or its format has another version or byte order.
     #[error("{0}")]
     Foreign(String),
-    /// The file has no end record, because its recorder was killed or bytes are missing. The records before are
+    /// The file has no end record, because its recorder was killed or bytes are missing. All records up to `offset` are
     /// complete.
     #[error(
         "the recording was cut short: expected a whole record at byte {offset}, got {got} bytes; good before it: \
@@ -121,21 +124,21 @@ pub enum RecordingError {
     Cut {
         /// Offset in the file where the last complete record ends, in bytes.
         offset: u64,
-        /// Number of bytes after it.
+        /// Number of bytes after the last complete record.
         got: u64,
-        /// Number of world steps before it.
+        /// Number of world steps in the complete records.
         n_steps: u64,
     },
-    /// The file contains bytes that no recorder wrote. The records before are complete.
+    /// The file contains bytes that no recorder wrote. All records up to `offset` are complete.
     #[error(
         "the recording is damaged at byte {offset}: {problem}; good before it: {n_steps} steps"
     )]
     Damaged {
-        /// Offset in the file where the record begins, in bytes.
+        /// Offset in the file where the damaged record begins, in bytes.
         offset: u64,
         /// What was expected and what was found.
         problem: String,
-        /// Number of world steps before it.
+        /// Number of world steps in the complete records.
         n_steps: u64,
     },
     /// A record does not fit the previous records, so it was not written.

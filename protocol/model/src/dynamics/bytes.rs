@@ -1,17 +1,17 @@
-//! Decides most cells with one random byte each.
+//! Draws the next state of most cells with one random byte each.
 //!
 //! Why it is fast: a few comparisons and blends of bytes decide 64 cells at a time.
 //!
-//! Why the distribution is the same: let `f(n)` be the most likely vote of a neighbour in state `n` (in the wildfire
-//! model, `n` itself). Whatever the neighbours' states, [`super::parents`] draws "tap `t`, and outcome `f(n_t)`" with a
-//! probability of at least `p[t] = min_n w[f(n), n, t] / C`. So `floor(256 * p[t])` of the 256 values of a byte stand
-//! for this draw. The other values, the *escapes*, leave the cell to `parents`, which first draws from the residual
-//! distribution. In the wildfire model, 24 of the 256 values escape. `tests/model/dynamics.rs` compares draws with
-//! `Phi` for random models and grids.
+//! Why the distribution is the same: let `f(n)` be the next state to which a neighbour in state `n` gives the most
+//! weight (in the wildfire model, `n` itself). Whatever the neighbours' states, [`super::parents`] draws "tap `t`, and
+//! outcome `f(n_t)`" with a probability of at least `p[t] = min_n w[f(n), n, t] / C`. So `floor(256 * p[t])` of the 256
+//! values of a byte stand for this draw. The other values, the *escapes*, leave the cell to `parents`, which first
+//! draws from the residual distribution. In the wildfire model, 24 of the 256 values escape. `tests/model/dynamics.rs`
+//! compares draws with `Phi` for random models and grids.
 //!
 //! If kernels depend on the cell's own state, so does the meaning of a byte value. The neighbour at the centre tap is
-//! then the cell itself, whose state is known, so `f` at this tap is the most likely vote of that state. If a cell is
-//! certain to keep its state, its byte always decides it.
+//! then the cell itself, whose state is known, so `f` at this tap is the next state to which that state gives the most
+//! weight. If a cell is certain to keep its state, its byte always decides it.
 //!
 //! If the model has several zones, the bounds of byte values differ between lanes. There is one table for each pattern
 //! of zones that occurs in a chunk of [`LANES`] cells.
@@ -26,33 +26,33 @@ use super::places::{Places, centre};
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// The meaning of byte values: a tap, or an escape.
+/// The meaning of each byte value: a tap, whose neighbour then decides the cell, or an escape.
 #[derive(Debug)]
 pub(super) struct Bytes {
     fast: Fast,
     /// The index in `fast` of each chunk's table, if the model has several zones. Otherwise all chunks use the first
     /// table.
     of_chunk: Option<Vec<u32>>,
-    /// One bit per home, which is set if the home belongs to a cell of the grid.
+    /// One bit per home (see `places.rs`), which is set if a cell of the grid has this home.
     on_grid: Vec<u64>,
 }
 
 #[derive(Debug)]
 enum Fast {
-    /// If kernels do not depend on the own state: one table per pattern of zones.
+    /// If kernels do not depend on the cell's own state: one table per pattern of zones.
     Alike {
         tables: Vec<Vec<FastTap>>,
         /// `f` as a table over bytes, or `None` if it maps every state to itself.
         likeliest: Option<Box<[u8; 256]>>,
     },
-    /// If kernels depend on the own state: one table per own state for each pattern of zones, and the offset of a cell
-    /// from its home.
+    /// If kernels depend on the cell's own state: one table per own state for each pattern of zones, and the offset of
+    /// a cell from its home.
     Own(Vec<Vec<FastOwn>>, usize),
 }
 
 impl Bytes {
     /// Makes the tables from the mixtures of each zone: one mixture for all cells, or one per own state. `zones`
-    /// contains the zone of each home. Without mixtures, every byte escapes.
+    /// contains the zone of each cell, indexed by home. Without mixtures, every byte escapes.
     pub(super) fn new(
         mixtures: &[Mixture],
         offsets: &[usize],
@@ -171,8 +171,8 @@ fn patterns(zones: &[u8]) -> (Vec<[u8; LANES]>, Option<Vec<u32>>) {
     (patterns, Some(of_chunk))
 }
 
-/// Returns the taps that byte values stand for, if kernels do not depend on the own state. `mixtures` contains the
-/// mixture of each lane.
+/// Returns the taps that byte values stand for, if kernels do not depend on the cell's own state. `mixtures` contains
+/// the mixture of each lane.
 fn fast_alike(mixtures: &[&Mixture; LANES], offsets: &[usize], is_zoned: bool) -> Vec<FastTap> {
     let taps = offsets.iter().enumerate();
     let taps = taps.map(|(tap, offset)| (mixtures.map(|it| it.counts()[tap]), *offset));
@@ -183,7 +183,7 @@ fn fast_alike(mixtures: &[&Mixture; LANES], offsets: &[usize], is_zoned: bool) -
     }
 }
 
-/// Returns the meaning of byte values in cells with one own state. `mixtures` contains the mixture of each lane.
+/// Returns the meaning of byte values in cells whose own state is `own`. `mixtures` contains the mixture of each lane.
 fn fast_own(
     own: usize,
     mixtures: &[&Mixture; LANES],
@@ -214,7 +214,7 @@ fn fast_own(
     }
 }
 
-/// Returns one bit per home, which is set if the home belongs to a cell of the grid.
+/// Returns one bit per home (see `places.rs`), which is set if a cell of the grid has this home.
 fn on_grid(shape: Shape, stride: usize) -> Vec<u64> {
     let mut bits = vec![0; (shape.height() * stride).div_ceil(LANES)];
     for row in 0..shape.height() {

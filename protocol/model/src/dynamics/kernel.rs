@@ -1,9 +1,9 @@
-//! The weights of paper eq. 2 by tap, and the draw of a state in proportion to weights.
+//! The weights of paper eq. 2 for each tap (kernel position), and the draw of a state in proportion to weights.
 
 use super::super::parameters::Model;
 use ndarray::Array4;
 
-/// The weights of eq. 2, for all cells or for cells in one own state.
+/// The weights of eq. 2, either for all cells or only for cells in one particular own state.
 #[derive(Debug, Clone)]
 pub(super) struct Kernel {
     pub(super) n_states: usize,
@@ -15,7 +15,7 @@ pub(super) struct Kernel {
 }
 
 impl Kernel {
-    /// Returns the kernels of a model, zone by zone: one per zone, or one per own state of the cell.
+    /// Returns the kernels of a model, zone by zone: for each zone either one kernel, or one for each own state.
     pub(super) fn of_model(model: &Model) -> Vec<Self> {
         let bias = model.bias().to_vec();
         let own = |index| (model.sees_own_state()).then_some(index % model.n_states());
@@ -28,7 +28,7 @@ impl Kernel {
     fn new(kernel: &Array4<f64>, bias: &[f64], own: Option<usize>) -> Self {
         let (n_states, _, kernel_height, kernel_width) = kernel.dim();
         let n_taps = kernel_height * kernel_width;
-        // Eq. 3 cancels a common factor. Dividing by the largest weight keeps sums of weights from overflowing.
+        // A common factor cancels in eq. 3. Dividing by the largest weight keeps sums of weights from overflowing.
         let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
         let mut weights = Vec::with_capacity(n_taps * n_states * n_states);
         for tap in 0..n_taps {
@@ -60,7 +60,7 @@ pub(super) fn uniform(random: u64) -> f64 {
     (random >> 11) as f64 * 2f64.powi(-53)
 }
 
-/// Returns the state at the fraction `uniform` of the cumulative weights, which need not sum to one.
+/// Returns the state at which the cumulative weights exceed the fraction `uniform` of their sum, which need not be one.
 pub(super) fn invert(weights: &[f64], uniform: f64) -> u8 {
     let target = uniform * weights.iter().sum::<f64>();
     let mut sum = 0.0;

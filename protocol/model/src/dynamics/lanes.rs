@@ -8,30 +8,31 @@ use super::super::randomness::split_mix;
 /// Number of cells processed at once, both to decide cells by bytes and to find the undecided ones.
 pub(super) const LANES: usize = 64;
 
-/// Mark of a cell that its byte left to the residual distribution. Its high bit distinguishes it from all states, and
-/// its even value from the mark of a rejected cell.
+/// Mark of a cell whose byte escaped, so that it must be drawn from the residual distribution. Its high bit
+/// distinguishes it from all states, and its even value from the mark of a rejected cell.
 const ESCAPED: u8 = 254;
 
 /// The byte values that stand for one tap.
 #[derive(Debug)]
 pub(super) struct FastTap {
     offset: usize,
-    /// In each lane, the last byte value of this tap. Its first value follows the last one of the previous tap. If
-    /// lanes differ, the bound is instead the first value beyond the tap, so that the tap can have no value in some
-    /// lanes.
+    /// For each lane, the last byte value that stands for this tap. The tap's first value follows the last value of the
+    /// previous tap. If bounds differ between lanes, each is instead the first value after the tap's values, so that
+    /// the tap can have no values in some lanes.
     bound: [u8; LANES],
 }
 
-/// The meaning of byte values in cells of one own state: first the centre tap, then the other taps.
+/// The meaning of byte values in cells with one own state. The lowest values stand for the centre tap, and the next
+/// ones for the other taps.
 #[derive(Debug)]
 pub(super) struct FastOwn {
     pub(super) own: u8,
-    /// The most likely vote of the cell itself.
+    /// The next state to which the cell itself gives the most weight.
     pub(super) likeliest: u8,
     /// The bound of the centre tap's byte values, as in [`FastTap`]. `None` if the tap has no values in any lane.
     pub(super) bound: Option<[u8; LANES]>,
     pub(super) neighbours: Vec<FastTap>,
-    /// The pairs `(n, f(n))` of neighbour states whose most likely vote is another state.
+    /// The pairs `(n, f(n))` of neighbour states `n` for which `f(n)` differs from `n`.
     pub(super) changes: Vec<(u8, u8)>,
 }
 
@@ -53,7 +54,7 @@ pub(super) fn fast_taps<const DIFFER: bool>(
     fast
 }
 
-/// Returns the bounds of the byte values below `end`.
+/// Converts the exclusive ends of a tap's byte values to bounds (see [`FastTap`]).
 pub(super) fn bounds<const DIFFER: bool>(end: [usize; LANES]) -> [u8; LANES] {
     let bound = |end: usize| if DIFFER { end } else { end - 1 };
     end.map(|end| u8::try_from(bound(end)).expect("invariant: fast probabilities sum to <= 1"))
@@ -103,8 +104,8 @@ impl Words {
 #[inline(always)]
 pub(super) fn blend<const DIFFER: bool>(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     let mut states = [ESCAPED; LANES];
-    // Bounds are cumulative. So the loop runs backwards, and each tap overwrites the lanes in which it precedes later
-    // taps.
+    // A byte within the bound of its tap is also within the bounds of all later taps. So the loop runs backwards, and
+    // each tap overwrites the results of later taps.
     for tap in fast.iter().rev() {
         let parent: &[u8; LANES] = parents[tap.offset..]
             .first_chunk()
@@ -181,8 +182,8 @@ pub(super) fn transposed(at: u32) -> u32 {
 
 /// For each set bit of [`high_bits`], writes `first` plus the bit's lane. May overwrite the rest of `to`.
 ///
-/// Always writes eight entries at a time, even if fewer are needed, as simdjson's `flatten_bits` does. A loop over the
-/// set bits alone would mispredict its end in most chunks.
+/// Always writes eight entries at a time, even if fewer are needed, as simdjson's `flatten_bits` does. With a loop over
+/// only the set bits, the processor would mispredict the end of the loop in most chunks.
 #[inline]
 pub(super) fn list_lanes(mut bits: u64, first: u32, to: &mut [u32; LANES]) {
     for eight in to.as_chunks_mut::<8>().0 {

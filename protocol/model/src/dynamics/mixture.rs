@@ -10,7 +10,7 @@ pub(super) struct Mixture<'k> {
     most: Vec<f64>,
     /// `C`, the sum of `most`.
     total: f64,
-    /// `f`: the most likely vote of each neighbour state at each tap, as `[tap][from]`.
+    /// `f`: for each tap and neighbour state, the next state with the largest weight, as `[tap][from]`.
     likeliest: Vec<Vec<usize>>,
     /// For each tap, the number of byte values (of 256) that stand for it.
     counts: Vec<usize>,
@@ -47,7 +47,8 @@ impl<'k> Mixture<'k> {
             (256.0 * certain.fold(f64::INFINITY, f64::min) / total) as usize
         };
         let mut counts: Vec<usize> = (0..kernel.n_taps).map(count).collect();
-        // If lanes differ, a bound is the first value beyond the tap. It must fit in a byte, so it is at most 255.
+        // If bounds differ between lanes, a bound is the first value after the tap's values. A bound must fit in a
+        // byte, so it is at most 255.
         if n_zones > 1
             && counts.iter().sum::<usize>() > 255
             && let Some(most) = counts.iter_mut().max()
@@ -94,7 +95,7 @@ impl<'k> Mixture<'k> {
     }
 
     /// Returns the end of each outcome's part of a tap's interval, as `[parent state][outcome]`. The part of the most
-    /// likely outcome is shortened by `taken`, the probability of the draws that bytes decide already.
+    /// likely outcome is shortened by `taken`, the probability with which bytes have already drawn this outcome.
     pub(super) fn ends(&self, tap: usize, taken: f64) -> Vec<Vec<f64>> {
         let of_parent = |(from, &likeliest): (usize, &usize)| {
             let mut end = 0.0;
@@ -124,7 +125,7 @@ fn likeliest(kernels: &[&Kernel], see_own_state: bool) -> Vec<Vec<usize>> {
     likeliest
 }
 
-/// Returns the most likely vote of each state, summed over some taps.
+/// Returns, for each state, the next state with the largest sum of weights over some taps.
 fn likeliest_under(kernels: &[&Kernel], taps: impl Iterator<Item = usize> + Clone) -> Vec<usize> {
     let n_states = kernels[0].n_states;
     let sum = |from, to| {

@@ -1,4 +1,4 @@
-//! Draws a *parent* of a cell: one neighbour, whose vote alone decides the cell.
+//! Draws a *parent* of a cell: one neighbour, whose weights alone decide the cell's next state.
 //!
 //! Why it is fast: a draw costs one random number and two look-ups, whatever the size of the kernel.
 //!
@@ -13,16 +13,16 @@ use super::lanes::Words;
 use super::mixture::Mixture;
 use super::places::{OFF_GRID, Places, centre};
 
-/// Mark of a cell to be drawn again, because its parent is off the grid or the vote was rejected. Its high bit
-/// distinguishes it from all states, and its odd value from the mark of an escaped byte.
+/// Mark of a cell to be drawn again, because its parent is off the grid or was rejected. Its high bit distinguishes it
+/// from all states, and its odd value from the mark of an escaped byte.
 const REJECTED: u8 = OFF_GRID;
 
 /// Maximum number of draws for a cell before its kernel is summed instead. The wildfire model rejects about 1 draw in
 /// 30, and 1 in 3 in a corner. Only models with very unequal column sums often need all the draws.
 const ROUNDS: usize = 8;
 
-/// Maximum number of rules of [`Parents`]. 64 states with a 3 x 3 kernel stay below it. Larger tables would not stay in
-/// any cache.
+/// Maximum number of rules of [`Parents`]. A model with 64 states and a 3 x 3 kernel stays below it. Larger tables
+/// would not stay in any cache.
 const MAX_RULES: usize = 1 << 16;
 
 /// Tables for drawing a tap and its outcome, either from the residual distribution of [`super::bytes`] or from the
@@ -40,18 +40,19 @@ pub(super) struct Parents {
     log_n_slots: u32,
     /// Rows of outcomes by parent state. The length of a row is a power of two.
     outcomes: Vec<u8>,
-    /// The bits of a parent's state that index a row. They map [`OFF_GRID`] to the row's last entry.
+    /// Bit mask that turns a parent's state into an index within a row, and [`OFF_GRID`] into the index of the last
+    /// entry.
     mask: u8,
     /// The offset of the cell from its home, if the cell's own state selects the mixture.
     own: Option<usize>,
-    /// The first mixture of each home's zone, if the model has several zones.
+    /// For each home, the index of the first mixture of its zone, if the model has several zones.
     first_mixtures: Option<Vec<u16>>,
 }
 
 /// A tap, and the outcome for each state of its parent.
 #[derive(Debug, Clone, Copy, Default)]
 struct Rule {
-    /// The place that the tap reads, relative to a cell's home.
+    /// The offset of the tap's neighbour from the cell's home (see `places.rs`).
     offset: u32,
     /// The start of the rule's row in `Parents::outcomes`.
     outcomes: u32,
@@ -66,9 +67,9 @@ struct Slot {
 }
 
 impl Parents {
-    /// Makes two tables for each mixture: one for the residual distribution that bytes leave, and one for the whole.
-    /// `offsets` contains the place that each tap reads, and `zones` the zone of each home. Returns `None` if there
-    /// would be too many rules.
+    /// Makes two tables for each mixture: one for the residual distribution that bytes leave, and one for the whole
+    /// distribution. `offsets` contains the offset of each tap's neighbour from a cell's home, and `zones` the zone of
+    /// each home. Returns `None` if there would be too many rules.
     pub(super) fn new(
         mixtures: &[Mixture],
         offsets: &[usize],
@@ -177,8 +178,8 @@ impl Parents {
     }
 }
 
-/// Returns the rules of a mixture with their lengths. Bytes have already decided the draw "tap `t`, most likely
-/// outcome" with probability `taken[t] / 256`, so this much is left out.
+/// Returns the rules of a mixture, each with its weight. Bytes have already decided the draw "tap `t`, most likely
+/// outcome" with probability `taken[t] / 256`, so the rules omit this part.
 fn rules(
     mixture: &Mixture,
     offsets: &[usize],
@@ -200,7 +201,8 @@ fn row_length(n_states: usize) -> usize {
     (n_states + 1).next_power_of_two()
 }
 
-/// Cuts a tap's interval into rules and appends them with their lengths. Appends their rows to `outcomes`.
+/// Cuts a tap's interval into rules. Appends each rule with its weight (the length of its piece) to `rules`, and its
+/// row to `outcomes`.
 fn add_rules(
     ends: &[Vec<f64>],
     length: f64,
@@ -231,8 +233,8 @@ fn add_rules(
     }
 }
 
-/// Makes an alias table of the rules, whose lengths need not sum to one (Vose, IEEE TSE 17(9), 1991). A table without
-/// rules must not be drawn from.
+/// Makes an alias table (Vose, IEEE TSE 17(9), 1991) of rules, whose weights need not sum to one. Nothing may be drawn
+/// from a table without rules.
 fn alias_table(rules: &[(f64, Rule)], n_slots: usize) -> Vec<Slot> {
     let per_slot = rules.iter().map(|(mass, _)| mass).sum::<f64>() / n_slots as f64;
     let mut left: Vec<f64> = rules.iter().map(|(mass, _)| mass / per_slot).collect();
@@ -260,6 +262,6 @@ fn alias_table(rules: &[(f64, Rule)], n_slots: usize) -> Vec<Slot> {
             small.push(over);
         }
     }
-    // The slots that remain in either list have a share of one, up to rounding, so each keeps a single rule.
+    // For the slots that remain in either list, `left` is one up to rounding, so each keeps a single rule.
     slots
 }

@@ -1,8 +1,9 @@
 //! The buffers of [`super::Dynamics`]: states with a margin around the grid, so that cells at the edge need no special
 //! treatment.
 //!
-//! Every cell has a place, and so has every position in a margin of half a kernel around the grid. A cell's *home* is
-//! the place at the upper left tap of its kernel; every tap reads at a fixed offset from there.
+//! A *place* is an index in the buffer of states. Every cell has a place, and so has every position in a margin of half
+//! a kernel around the grid. A cell's *home* is the place of the neighbour at the upper left of its kernel, so every
+//! neighbour lies at a fixed offset from the home.
 
 use super::super::grid::Shape;
 use super::super::parameters::Model;
@@ -18,7 +19,8 @@ pub(super) struct Places {
     margins: [usize; 2],
     /// `X_k`. The margin contains the model's edge state, or [`OFF_GRID`].
     pub(super) states: Vec<u8>,
-    /// Indexed by home: first random bytes, then next states and the marks of undecided cells, finally `X_{k+1}`.
+    /// Indexed by home. During a step it contains first random bytes, then next states and the marks of undecided
+    /// cells, and finally `X_{k+1}`.
     pub(super) next: Vec<u8>,
 }
 
@@ -44,14 +46,15 @@ impl Places {
         (n_places, n_homes)
     }
 
-    /// Returns the offset, from a cell's home, of the place that each tap of a model's kernel reads.
+    /// Returns, for each tap of a model's kernel, the offset of the neighbour's place from the cell's home.
     pub(super) fn offsets(&self, model: &Model) -> Vec<usize> {
         let (_, _, kernel_height, kernel_width) = model.kernel().dim();
         let taps = ndarray::indices((kernel_height, kernel_width)).into_iter();
         taps.map(|(row, col)| row * self.stride + col).collect()
     }
 
-    /// Returns the zone of each home, if the model has several zones. The margin has zone 0.
+    /// Returns the zone of each cell, indexed by home, if the model has several zones. Homes that belong to no cell
+    /// have zone 0.
     pub(super) fn zones(&self, model: &Model) -> Option<Vec<u8>> {
         let map = model.zone_map().filter(|_| model.n_zones() > 1)?;
         let mut zones = vec![0; self.next.len()];

@@ -3,8 +3,8 @@
 use super::super::grid::Shape;
 use super::super::vectors::LANES;
 
-/// The layout of a belief in planes, one per state. Each plane has a margin of half a kernel on each side. The right
-/// margin is wider, so that each row consists of whole chunks of [`LANES`] cells.
+/// A memory layout for a belief, with one plane per state. Each plane has a margin of half a kernel on each side. The
+/// right margin is wider, so that each row consists of whole chunks of [`LANES`] cells.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Layout {
     pub(super) above: usize,

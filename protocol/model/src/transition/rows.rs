@@ -18,9 +18,9 @@ pub(super) type Rows<T> = Vec<Row<T>>;
 
 #[derive(Debug, Clone)]
 pub(super) enum Kernels<T> {
-    /// The same for every cell.
+    /// One kernel for all cells.
     Alike(Rows<T>),
-    /// One per own state of the cell.
+    /// One kernel for each own state (the state of the cell itself).
     Own(Vec<Own<T>>),
 }
 
@@ -37,11 +37,11 @@ pub(super) enum Own<T> {
 #[derive(Debug, Clone)]
 pub(super) struct Row<T> {
     bias: T,
-    /// The slot of the bias, if it differs between zones.
+    /// The slot of the bias, if the bias differs between zones.
     bias_slot: Option<usize>,
-    /// Groups with their weights.
+    /// Groups of taps, each with its weight.
     terms: Vec<(usize, T)>,
-    /// Groups with their slots, for weights that differ between zones.
+    /// Groups of taps whose weight differs between zones, each with the slot of this weight.
     zoned_terms: Vec<(usize, usize)>,
 }
 
@@ -62,8 +62,8 @@ impl<T: NdFloat> Own<T> {
         }
     }
 
-    /// Adds the probability of each next state, for cells that are in this own state with probability `p`. `slots`
-    /// contains the zoned weights of the lanes.
+    /// Adds to `next` the probability of each next state, for cells that are in this own state with probability `p`.
+    /// `slots` contains each lane's values of the weights that differ between zones.
     #[inline(always)]
     pub(super) fn add(
         &self,
@@ -104,7 +104,7 @@ impl<T: NdFloat> Own<T> {
 }
 
 impl<T: NdFloat> Row<T> {
-    /// Returns whether the row has a weight, or a bias that differs between zones.
+    /// Returns whether the row has any weights, or has a bias that differs between zones.
     fn is_weighed(&self) -> bool {
         self.bias_slot.is_some() || !self.terms.is_empty() || !self.zoned_terms.is_empty()
     }
@@ -130,8 +130,9 @@ impl<T: NdFloat> Row<T> {
     }
 }
 
-/// Returns the rows of eq. 2 for cells in state `own`, or for all cells. `kernels` contains one kernel per zone, and
-/// `columns` the weights of the groups. Appends weights that differ between zones to `slots`.
+/// Returns the rows of eq. 2 for cells in state `own`, or for all cells if kernels do not depend on the cell's own
+/// state. `kernels` contains one kernel per zone, and `columns` the weights of the groups. Appends weights that differ
+/// between zones to `slots`.
 pub(super) fn kernel_rows<T: NdFloat>(
     own: usize,
     kernels: &[&Array4<f64>],
@@ -140,7 +141,7 @@ pub(super) fn kernel_rows<T: NdFloat>(
     columns: &[Vec<f64>],
     slots: &mut Slots<T>,
 ) -> Rows<T> {
-    // Eq. 3 cancels a common factor. Dividing by the largest weight keeps the weights in the range of `T`.
+    // A common factor cancels in eq. 3. Dividing by the largest weight keeps the weights in the range of `T`.
     let weights = kernels.iter().flat_map(|kernel| kernel.iter());
     let largest = weights.chain(bias).copied().fold(0.0, f64::max);
     let scaled = |weight: f64| T::from(weight / largest).expect("invariant: f64 casts to T");
@@ -176,9 +177,9 @@ pub(super) fn kernel_rows<T: NdFloat>(
     (0..n_states).map(&mut row).collect()
 }
 
-/// Groups the taps whose columns of weights `w[.., n, a, c]` are equal in every kernel. Returns the offsets of each
-/// group, and its columns in all kernels as one vector. Leaves out taps without weight, and the centre tap if kernels
-/// depend on the own state.
+/// Groups the taps whose columns of weights `w[.., n, a, c]` are equal in every kernel. For each group, returns its
+/// columns in all kernels as one vector, and the offsets of its taps. Leaves out taps without weight, and the centre
+/// tap if kernels depend on the own state.
 pub(super) fn taps_that_weigh_alike(
     kernels: &[Array4<f64>],
     sees_own_state: bool,

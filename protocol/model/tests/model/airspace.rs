@@ -1,4 +1,4 @@
-//! Compares where robots may fly and what they see with plain loops over all cells of the grid.
+//! Compares the cells where robots may fly, and the cells that they see, with the results of plain loops over the grid.
 
 use super::models::{shape, unit};
 use super::refusals::LAND;
@@ -13,7 +13,7 @@ fn random_map(key: u64, (height, width): (usize, usize)) -> Grid<bool> {
 }
 
 proptest! {
-    // Writes no file of failures, because tests must not change the source tree.
+    // Failures are not written to a file, because tests must not change the source tree.
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..Default::default() })]
 
     #[test]

@@ -1,4 +1,5 @@
-//! Checks that steps are drawn from the formula for any model, and that worlds resemble the authors' worlds.
+//! Checks that steps of any model are drawn with the probabilities of the formula, and that worlds resemble the
+//! authors' worlds.
 
 use super::models::{
     checked, formula, model, random_land, random_model, random_own_model, random_states, shape,
@@ -34,9 +35,10 @@ fn check(model: &Model, states: &Grid<u8>, n_draws: u64) {
     assert!(z.abs() < 5.0, "{}: {z} standard deviations", model.name());
 }
 
-/// Returns the chi-square of counts by cell and outcome, in standard deviations. Outcomes expected fewer than 10 times
-/// share a bin, and impossible outcomes must not occur. Cells are independent, so statistics and degrees of freedom add
-/// up. With d degrees of freedom, the sum has mean d and variance 2d.
+/// Returns the chi-square statistic of counts by cell and outcome, as its distance from the mean in standard
+/// deviations. Outcomes expected fewer than 10 times share a bin, and impossible outcomes must not occur. Cells are
+/// independent, so statistics and degrees of freedom add up. With d degrees of freedom, the sum has mean d and variance
+/// 2d.
 fn chi_square(counts: &Array3<f64>, expected: &Array3<f64>) -> f64 {
     let (mut sum, mut freedom) = (0.0, 0.0);
     let mut term = |observed: f64, expected: f64| {
@@ -130,7 +132,7 @@ fn lands_are_drawn_from_the_formula() {
         let states = random_states(8, n_states, side);
         check(&random_land(7, &models, side), &states, n_draws);
     }
-    // No cell of a river burns, so its bytes always decide.
+    // Cells of a river never burn, so a random byte always decides them.
     let mut river = burnout().file().clone();
     let entry = |state: &String| KernelEntry {
         zone: None,
@@ -178,8 +180,8 @@ fn deterministic_models_move_as_they_must() {
     }
 }
 
-/// Returns the FNV-1a hash (http://www.isthe.com/chongo/tech/comp/fnv) of a world after some steps. The dynamics have
-/// stepped another world before.
+/// Returns the FNV-1a hash (http://www.isthe.com/chongo/tech/comp/fnv) of a world after some steps. The same `Dynamics`
+/// steps another world first, which must not matter.
 fn hash_after(model: &Model, shape: Shape, n_steps: u64) -> u64 {
     let mut dynamics = Dynamics::new(model, shape).expect("test model");
     dynamics.step(8, 3, &mut dynamics.initial(8));
@@ -227,8 +229,8 @@ fn worlds_look_like_the_authors() {
             ours[name]
         );
     }
-    // Wide error bars are not the only reason for the agreement: in the example, the drift is 20 standard errors from
-    // zero.
+    // The agreement is not only due to wide error bars: in the example, the drift of the fire is 20 standard errors
+    // from zero.
     let drift = ours["new_fire_above_minus_below"];
     assert!(drift.mean > 5.0 * drift.se, "{drift:?}");
 }
@@ -238,7 +240,7 @@ fn initial_states_follow_the_models_distribution() {
     let dynamics = Dynamics::new(&Model::wildfire(), shape(64, 64)).expect("wildfire");
     let worlds: Vec<Grid<u8>> = (0..50).map(|seed| dynamics.initial(seed)).collect();
     let count = |state| worlds.iter().flatten().filter(|&&s| s == state).count() as f64;
-    // Latent with probability .01 in each of 204,800 cells: 2048 +- 45.
+    // Each of 204,800 cells is latent with probability 0.01, so 2048 +- 45 latent cells are expected.
     assert!((count(1) - 2048.0).abs() < 4.0 * 45.0, "{}", count(1));
     assert_eq!(count(2), 0.0);
     assert_ne!(worlds[0], worlds[1]);

@@ -27,7 +27,7 @@ kernel = [
 ]
 "##;
 
-/// Part of [`LAND`] => its replacement => part of the error.
+/// Each row: a part of [`LAND`] => its replacement => a part of the resulting error.
 const WRONG: &str = r##"
 name = "land" => name = 3 => model file: 
 states = [ => states = [], no = [ => model file: 

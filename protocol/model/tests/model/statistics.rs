@@ -5,10 +5,12 @@
 //! over steps 15,000 to 35,000 of one 64 x 64 run. Ratios are ratios of counts over the whole run.
 //! - `mean_fraction_s`, `within_run_sd_fraction_s`: fraction of cells in state s, mean and standard
 //!   deviation over time
-//! - `transitions_per_step_atob`, `cond_prob_atob`, `changes_per_step`: cells with `X = a`, `X' = b`
-//! - `p_fire_D_given_s`: among cells in state s with a neighbour D, that neighbour is on fire
-//! - `new_fire_fraction_with_D_on_fire_before`: among cells with `X != fire`, `X' = fire` and a
-//!   neighbour D, that neighbour was on fire in `X`; likewise for latent
+//! - `transitions_per_step_atob`, `cond_prob_atob`, `changes_per_step`: the number of cells per step with `X = a` and
+//!   `X' = b`, their share of the cells with `X = a`, and the number of cells per step that change
+//! - `p_fire_D_given_s`: among cells in state s with a neighbour in direction D, the fraction whose neighbour there is
+//!   on fire
+//! - `new_fire_fraction_with_D_on_fire_before`: among cells with `X != fire`, `X' = fire` and a neighbour in direction
+//!   D, the fraction whose neighbour there was on fire in `X`; likewise for latent
 
 use emberwatch_model::{Dynamics, Grid, Model, Shape};
 use std::collections::BTreeMap;
@@ -157,8 +159,8 @@ impl Counts {
 
     fn insert_neighbours(&self, all: &mut Statistics) {
         for (seen, (name, ..)) in self.neighbours.iter().zip(DIRECTIONS) {
-            // Cells are selected by their states before and after the step. This is the share of them whose neighbour
-            // is in a given state.
+            // Among the cells that `is_counted` selects by their states before and after the step, the share whose
+            // neighbour is in a given state.
             let share = |neighbour: usize, is_counted: &dyn Fn(usize, usize) -> bool| {
                 let mut counts = [0.0; 3];
                 for (neighbour, from, to) in ndarray::indices((3, 3, 3)) {

@@ -25,7 +25,7 @@ fn assert_close(got: &Array3<f64>, expected: &Array3<f64>, bound: f64) {
 }
 
 proptest! {
-    // Writes no file of failures, because tests must not change the source tree.
+    // Failures are not written to a file, because tests must not change the source tree.
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..Default::default() })]
 
     #[test]

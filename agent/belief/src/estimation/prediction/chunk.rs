@@ -1,6 +1,6 @@
 //! Computes the next-state distributions of a chunk of cells from the beliefs about their neighbours.
 //!
-//! The [parent module](super) defines the symbols.
+//! The [parent module](super) defines the symbols in these comments.
 
 use super::kernels::{Group, OwnKernel, Source};
 use super::lanes::{
@@ -11,10 +11,10 @@ use super::layout::Layout;
 /// Nodes `s` and weights of the Gauss-Laguerre quadrature.
 const NODES: [(f32, f32); 2] = [(0.585_786_46, 0.853_553_4), (3.414_213_7, 0.146_446_6)];
 
-/// A single node at 0, where the quadrature is the mean field. Exact if the total `D` is certain.
+/// A single node at 0, with which the quadrature computes the mean field. This is exact if the total `D` is certain.
 const MEAN_FIELD: [(f32, f32); 1] = [(0.0, 1.0)];
 
-/// Totals of weights up to this value are treated as zeros with rounding errors.
+/// Totals of weights up to this value count as zero, because they may be rounding errors.
 const MIN_TOTAL: f32 = 1e-30;
 
 /// Work space and results of the prediction of one chunk of cells.
@@ -22,12 +22,13 @@ const MIN_TOTAL: f32 = 1e-30;
 pub struct ChunkPredictor {
     /// For each kernel, the probability of each of its next states.
     pub distributions: Vec<Vec<Lanes>>,
-    /// For each neighbour, the probabilities of the susceptible state's kernel, given that this neighbour is
+    /// For each neighbour, the next-state probabilities of the susceptible state's kernel, given that this neighbour is
     /// susceptible.
     pub cavity_distributions: Vec<Vec<Lanes>>,
-    /// For each source, the belief that a neighbour is in its state, summed over the group's neighbours.
+    /// For each source (a state of the group's neighbours), the belief that a neighbour is in this state, summed over
+    /// the group.
     belief_sums: Vec<Lanes>,
-    /// For each source, the same belief divided by `f_k`, summed over the group's neighbours.
+    /// For each source, the same sum, but with each neighbour's belief divided by the neighbour's `f_k`.
     ratio_sums: Vec<Lanes>,
     /// The weight of each next state.
     weights: Vec<Lanes>,
@@ -42,12 +43,12 @@ pub struct ChunkPredictor {
 /// Input of the prediction of one chunk.
 #[derive(Clone, Copy)]
 pub struct ChunkInputs<'a> {
-    /// The value in each slot of the layout.
+    /// The value of each weight slot (see [`OwnKernel`]).
     pub slots: &'a [Lanes],
     /// The planes of all beliefs.
     pub planes: &'a [f32],
     pub plane_length: usize,
-    /// For each neighbour, the index in `planes` of the belief in its state 0.
+    /// For each neighbour, the index in `planes` of the belief that the neighbour is in state 0.
     pub places: &'a [usize],
 }
 
@@ -240,8 +241,8 @@ impl ChunkPredictor {
 
     /// Adds the term of one node to the cavity distributions of a group's neighbours.
     ///
-    /// Each cavity assumes that its neighbour `k` is susceptible. The weights in that state then replace `g_k[m]`, and
-    /// `exp(-t d)` replaces `f_k`. `factor` contains the product of all `f_k`.
+    /// Each cavity assumes that its neighbour `k` is susceptible. The neighbour's weights in that state then replace
+    /// `g_k[m]`, and `exp(-t d)` replaces `f_k`. `factor` contains the product of all `f_k`.
     #[inline(always)]
     fn add_cavities(
         &mut self,
@@ -287,7 +288,7 @@ impl ChunkPredictor {
 
 /// Results for the neighbours of a group.
 struct GroupProducts<'a> {
-    /// The product that is multiplied by each `f_k`.
+    /// The running product, which is multiplied by the `f_k` of each neighbour.
     factor: &'a mut Lanes,
     inverse_factors: &'a mut [Lanes],
     ratio_sums: &'a mut [Lanes],
@@ -345,7 +346,7 @@ fn multiply_factors(
     }
 }
 
-/// Divides weights by their total, so that they are probabilities. Where the total is 0, copies `otherwise`.
+/// Divides weights by their total, so that they become probabilities. Where the total is 0, copies `otherwise`.
 #[inline(always)]
 fn normalise(weights: &mut [Lanes], otherwise: Option<&[Lanes]>) {
     for lanes in weights.iter_mut() {

@@ -1,5 +1,5 @@
-//! Transition weights, and the kernels that a prediction reads. These contain only positive weights, and group the
-//! neighbours that have equal weights.
+//! Transition weights, and the kernels that a prediction reads. The kernels contain only positive weights, and combine
+//! neighbours with equal weights into groups.
 
 use emberwatch_model::{Grid, Model};
 use ndarray::Array4;
@@ -28,16 +28,16 @@ impl<'a> From<&'a Model> for Weights<'a> {
     }
 }
 
-/// The weights of one own state (the cell's current state) that depend on the neighbours' states.
+/// The transition weights of a cell in one current state (its *own state*) in which neighbours can influence it.
 ///
-/// Weights are stored in *slots* (`Layout::slots`), because they can differ between zones.
+/// Weights are stored as indices into `Layout::slots` (their *slots*), because their values can differ between zones.
 #[derive(Debug, Clone)]
 pub struct OwnKernel {
     /// The own state. If `None`, the kernel applies to all own states.
     pub own_state: Option<usize>,
     /// The possible next states.
     pub next_states: Vec<usize>,
-    /// The slot of each next state's weight without neighbours. It includes the centre of an own-state kernel.
+    /// The slot of each next state's weight without neighbours: its bias plus the centre weight of an own-state kernel.
     pub bias_slots: Vec<usize>,
     pub groups: Vec<Group>,
     /// The slots of the distinct totals `d` that a neighbour's weights can have.
@@ -51,7 +51,7 @@ pub struct OwnKernel {
 /// Neighbours with equal weights.
 #[derive(Debug, Clone)]
 pub struct Group {
-    /// Indices in `Layout::taps`.
+    /// The indices of the neighbours in `Layout::taps`.
     pub neighbours: Vec<usize>,
     pub sources: Vec<Source>,
 }
@@ -60,13 +60,13 @@ pub struct Group {
 #[derive(Debug, Clone)]
 pub struct Source {
     pub state: usize,
-    /// The total `d` of its weights, as an index in [`OwnKernel::total_slots`].
+    /// The total `d` of the weights in this state, as an index in [`OwnKernel::total_slots`].
     pub total: usize,
-    /// For each positive weight, the index in [`OwnKernel::next_states`] and the slot.
+    /// For each positive weight, the index of its next state in [`OwnKernel::next_states`], and its slot.
     pub terms: Vec<(usize, usize)>,
 }
 
-/// The transition of an own state that no neighbour influences.
+/// The transition from an own state in which no neighbour influences the cell.
 #[derive(Debug, Clone)]
 pub struct FixedTransition {
     pub own_state: usize,

@@ -49,7 +49,7 @@ pub fn divided(a: f32, by: &Lanes) -> Lanes {
     to
 }
 
-/// Returns the sum of several values for each lane.
+/// Returns the sum of several vectors, lane by lane.
 #[inline(always)]
 pub fn sum(all: &[Lanes]) -> Lanes {
     let mut sum = [0.0; LANES];
@@ -65,7 +65,7 @@ pub fn sum(all: &[Lanes]) -> Lanes {
 /// polynomial of degree 6.
 #[inline(always)]
 pub fn exponential(a: &Lanes, b: &Lanes) -> Lanes {
-    // Adding 1.5 * 2^23 rounds a number to an integer, which the lowest bits of the sum contain.
+    // Adding 1.5 * 2^23 rounds a number to an integer. The lowest bits of the sum contain this integer.
     const ROUNDING: f32 = 12_582_912.0;
     let mut to = [0.0; LANES];
     for lane in 0..LANES {

@@ -4,8 +4,8 @@ use super::kernels::{FixedTransition, Group, OwnKernel, Source, Weights};
 use emberwatch_model::zoned::ZonedNumbers;
 use ndarray::Array4;
 
-/// Maximum difference between totals of scaled weights that count as equal. It exceeds the rounding errors of the
-/// summation.
+/// Totals of scaled weights that differ by at most this value count as equal. The value exceeds the rounding errors of
+/// the summation.
 const TOTAL_TOLERANCE: f64 = 1e-9;
 
 /// All weights of a model, arranged for predictions.
@@ -13,9 +13,9 @@ const TOTAL_TOLERANCE: f64 = 1e-9;
 pub struct Layout {
     pub kernels: Vec<OwnKernel>,
     pub fixed: Vec<FixedTransition>,
-    /// Row and column of each neighbour in the kernel. With own-state kernels, the centre is not a tap.
+    /// Row and column of each neighbour in the kernel. Without own-state kernels, the centre counts as a neighbour too.
     pub taps: Vec<[usize; 2]>,
-    /// The value in each slot, by the zone of the cell.
+    /// The value of each slot in the zone of each cell.
     pub slots: ZonedNumbers<f32>,
 }
 
@@ -48,7 +48,8 @@ impl Layout {
     }
 }
 
-/// A builder of kernels, which collects their slots. Values that depend on the zone are lists with one entry per zone.
+/// A builder of kernels, which also collects the values of their slots. Values that depend on the zone are lists with
+/// one entry per zone.
 struct Builder<'a> {
     weights: Weights<'a>,
     n_states: usize,
@@ -60,7 +61,7 @@ struct Builder<'a> {
     /// For each own state, the power of two that scales its largest weight to at least 1 and less than 2, so that all
     /// weights fit in `f32`.
     scales: Vec<f64>,
-    /// The value in each slot, by zone.
+    /// The value of each slot in each zone.
     slots: Vec<Vec<f32>>,
 }
 
@@ -89,7 +90,7 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// Builds the kernel of an own state. A kernel that applies to all own states has index 0.
+    /// Builds the kernel of an own state. If one kernel applies to all own states, `own` is 0.
     fn own_kernel(&mut self, own: usize) -> OwnKernel {
         let next_states = self.next_states(own);
         let biases: Vec<_> = next_states.iter().map(|m| self.bias(own, *m)).collect();
@@ -114,7 +115,7 @@ impl<'a> Builder<'a> {
         kernel
     }
 
-    /// Builds the transition of an own state that no neighbour influences.
+    /// Builds the transition from an own state in which no neighbour influences the cell.
     fn fixed_transition(&mut self, own_state: usize) -> FixedTransition {
         let biases: Vec<_> = (0..self.n_states)
             .map(|m| self.bias(own_state, m))
@@ -198,7 +199,7 @@ impl<'a> Builder<'a> {
         (0..self.n_states).filter(has_any).collect()
     }
 
-    /// Lists the sources of a neighbour, and adds their totals to the kernel.
+    /// Lists the states in which a neighbour has positive weights, and adds the totals of these weights to the kernel.
     fn sources(&mut self, own: usize, tap: [usize; 2], kernel: &mut OwnKernel) -> Vec<Source> {
         let mut sources = Vec::new();
         for state in 0..self.n_states {
@@ -247,7 +248,7 @@ impl<'a> Builder<'a> {
         groups
     }
 
-    /// Computes [`OwnKernel::influence`], the mean over zones.
+    /// Computes [`OwnKernel::influence`] as the mean over zones.
     fn influence(&self, own: usize) -> f64 {
         let n = self.n_states;
         let influence = |kernel: &Array4<f64>| {

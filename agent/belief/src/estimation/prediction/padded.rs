@@ -6,7 +6,7 @@ use crate::estimation::belief::Belief;
 use emberwatch_model::Shape;
 use emberwatch_model::vectors::vectorised;
 
-/// Maximum factor by which a correction multiplies a probability. It keeps sums of products finite.
+/// Maximum factor by which a correction multiplies a probability. This limit keeps sums of products finite.
 const MAX_FACTOR: f32 = 1e30;
 
 /// Beliefs about one grid: a cavity per neighbour, if there are cavities, then the belief itself.
@@ -50,13 +50,13 @@ impl PaddedBeliefs {
         }
     }
 
-    /// Returns the start of a cavity's first plane. The index `n_cavities` stands for the belief itself.
+    /// Returns the index at which a cavity's first plane starts. The index `n_cavities` stands for the belief itself.
     #[inline(always)]
     pub fn start(&self, cavity: usize) -> usize {
         cavity * self.n_states * self.planes.length
     }
 
-    /// Replaces the belief itself.
+    /// Replaces the belief, but not the cavities.
     pub fn set_belief(&mut self, belief: &[f32]) {
         let start = self.start(self.n_cavities);
         self.planes.put(belief, &mut self.probabilities[start..]);
@@ -149,8 +149,8 @@ impl PaddedBeliefs {
     }
 }
 
-/// Computes the factors that turn `before` into `after`, for each state and cell of a chunk. States are `n_cells`
-/// values apart.
+/// Computes the factors that turn `before` into `after`, for each state and cell of a chunk. The values of successive
+/// states are `n_cells` apart.
 ///
 /// Returns whether each cell's belief has changed.
 #[inline(always)]

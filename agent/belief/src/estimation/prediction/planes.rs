@@ -3,7 +3,7 @@
 use super::lanes::LANES;
 use emberwatch_model::Shape;
 
-/// The position of a grid's cells in a plane: rows with a margin on each side, row-major.
+/// The memory layout of a plane: the grid with margins on all sides, row-major.
 #[derive(Debug, Clone, Copy)]
 pub struct Planes {
     shape: Shape,
@@ -32,7 +32,8 @@ impl Planes {
         (row + self.margin[0]) * self.stride + col + self.margin[1]
     }
 
-    /// Returns the distance from a cell to its neighbour at a tap of the kernel.
+    /// Returns the offset from a cell's index to a neighbour's index, given the neighbour's row and column in the
+    /// kernel.
     pub fn offset(&self, [row, col]: [usize; 2]) -> isize {
         (row * self.stride + col) as isize - self.place([0, 0]) as isize
     }

@@ -194,7 +194,8 @@ const BIAS: [f64; 3] = [0.01, 0.001, 0.001];
 
 #[test]
 fn cavities_sum_to_one_with_several_own_state_kernels() {
-    // Own-state kernels like learned kernels: neighbours influence every own state, and state 1 the most.
+    // Own-state kernels that resemble learned ones: neighbours influence a cell in every own state, and in state 1 the
+    // most.
     let kernel = |own: usize| {
         Array4::from_shape_fn((3, 3, 3, 3), |(m, n, row, col)| {
             let scale = if own == 1 { 1.0 } else { 0.05 };

@@ -5,7 +5,7 @@
 //! np.savez(name, table=table, cells=cells, obs=obs, first_predictor=u_1, post=posteriors[2::3])  # 32 bits
 //! ```
 //!
-//! Cells are listed in order of first visit, and padded with -1 if a path visits fewer cells.
+//! The cells of each path are listed in order of the first visit, and shorter lists are padded with -1.
 
 use super::*;
 use crate::estimation::correlations::N_AGES;
@@ -18,7 +18,7 @@ use std::fs::File;
 
 const FIRE: usize = 2;
 
-/// Returns the wildfire model with a change to its file.
+/// Returns the wildfire model after a change to its model file.
 fn wildfire(change: impl FnOnce(&mut ModelFile)) -> Model {
     let mut file = Model::wildfire().file().clone();
     change(&mut file);
@@ -43,7 +43,7 @@ fn corrections_agree_with_an_independent_implementation() {
         let prior = Belief::from_probabilities(first).expect("a belief");
         let filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid");
         let mut filter = SpatialFilter::new(filter, FIRE, Correlations::of_table(&table));
-        // The vectors start after the first prediction.
+        // The test vectors start after the first prediction.
         filter.ages.grow();
         for (step, (cells, seen)) in cells.outer_iter().zip(observed.outer_iter()).enumerate() {
             let seen = cells.iter().zip(seen).filter(|(cell, _)| **cell >= 0);
@@ -64,7 +64,8 @@ fn an_impossible_frame_changes_nothing_with_or_without_spread() {
     let model = wildfire(|file| file.states[0].observed_as = vec![1.0, 0.0, 0.0]);
     let states = ndarray::arr2(&[[2, 2], [0, 2]]);
     let prior = Belief::from_states(&states, 3).expect("states");
-    // Cell 0 could be corrected. Cell 2 is certainly normal, and this model never shows a normal cell as fire.
+    // The observation of cell 0 is possible. The observation of cell 2 is not: the cell is certainly normal, and this
+    // model never shows a normal cell as fire.
     let frame = Frame::from_bytes(shape(2, 2), 3, &[2, 255, 2, 2]).expect("a frame");
     let filter = BayesFilter::known(&model, prior).expect("valid");
     for neighbours in [None, Some((FIRE, Correlations::default()))] {

@@ -8,8 +8,8 @@ const MIN_PROBABILITY: f64 = 1e-6;
 
 /// Replaces each cell's distribution over observations, `[O, H, W]`, with its distribution over states.
 ///
-/// `inverse` is the inverse of `P(y | x)`. Some predictions of a network correspond to no distribution over states.
-/// Therefore, negative values are raised to a small minimum, and the result is normalised.
+/// `inverse` is the inverse of `P(y | x)`. For some predictions of a network, the result has negative values. They are
+/// raised to a small minimum, and the result is normalised.
 pub fn states_from_observations(probabilities: &mut Probabilities, inverse: &Array2<f64>) {
     let (n, height, width) = probabilities.dim();
     let mut states = vec![0.0; n];

@@ -73,7 +73,7 @@ fn predictions_together_equal_predictions_alone() {
     });
     let estimators = || -> Vec<Box<dyn Estimator>> {
         let mut all = vec![filter()];
-        // The networks alternate, with and without a corrected filter.
+        // The two networks alternate, each with and without a filter to correct.
         for index in 0..8 {
             let below = (index % 4 > 1).then(filter);
             let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());

@@ -39,7 +39,7 @@ pub struct Base {
 }
 
 impl Base {
-    /// Creates the base of a belief. `known` is the model and the first belief, for kinds that know the model.
+    /// Creates the base for a kind of belief. `known` is the model and the first belief, for kinds that know the model.
     ///
     /// # Errors
     /// If the model or the learned value that the kind uses is missing.

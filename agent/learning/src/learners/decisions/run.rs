@@ -57,7 +57,8 @@ impl Run {
         })
     }
 
-    /// Ends the episode. Returns the transitions of its last steps, which all lead to the options in the final state.
+    /// Ends the episode. Returns the transitions of the episode's last steps, whose next state is always the final
+    /// state.
     pub(super) fn end(&mut self, dqn: &Dqn) -> Vec<Transition> {
         let features = features(&self.propose());
         let full = self.led_to(&features, dqn);
@@ -74,7 +75,7 @@ impl Run {
         }
     }
 
-    /// Restores a run from a checkpoint. `rollout` must not have been corrected yet.
+    /// Restores a run from a checkpoint. The belief of `rollout` must not have been corrected yet.
     pub(super) fn restore(saved: SavedRun, mut rollout: Rollout, dqn: &Dqn) -> Result<Self> {
         saved.resume_point.restore(&mut rollout.agent)?;
         rollout.agent.memory = saved.memory;

@@ -20,7 +20,7 @@ use std::sync::Arc;
 /// The shape of the DQN: features per option, and number of options.
 pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
 
-/// Upper limit on due updates. It is above the number that one step of all worlds can add.
+/// Maximum number of updates that can be due. It exceeds the number that one step of all worlds can add.
 const MAX_EARNED: f64 = 2e6;
 
 /// Maximum number of steps for which an option is held.

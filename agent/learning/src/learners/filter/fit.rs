@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 /// Suffixes of tensor names: parameters, mean gradients and mean squared gradients.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
-/// Upper limit on due updates. It is above the number that one step of all worlds can add.
+/// Maximum number of updates that can be due. It exceeds the number that one step of all worlds can add.
 const MAX_EARNED: f64 = 2e6;
 
 /// A filter that is fitted to frames as they arrive. A checkpoint stores this struct, and its tensors separately.
@@ -31,7 +31,7 @@ pub struct FilterFit {
     pub reward: RewardEstimate,
     /// Number of world steps, for all worlds together.
     pub world_steps: u64,
-    /// Updates that are due but not made yet.
+    /// Number of updates that are due but not made yet.
     pub earned: f64,
     replay: BlockReplay,
     neighbours: Neighbours,
@@ -62,8 +62,8 @@ impl FilterFit {
         self.replay.has_track(robot)
     }
 
-    /// Adds a robot's next frame. `predictor` is the belief before it (`None` for the first), and `learned` the current
-    /// model.
+    /// Adds a robot's next frame. `predictor` is the belief before the frame (`None` for the track's first frame), and
+    /// `learned` is the current model.
     pub fn see(
         &mut self,
         robot: u32,
@@ -76,8 +76,8 @@ impl FilterFit {
         self.neighbours.see(robot, frame, predictor, tables, target);
     }
 
-    /// Records the reward of a path. `posterior` is the belief after its frame, and `paying` contains the rewarded
-    /// cells.
+    /// Records the reward of a path. `posterior` is the belief after the path's frame, and `paying` contains the cells
+    /// that the reward is summed over.
     pub fn earn(&mut self, posterior: &Belief, paying: &[usize], reward: f64) {
         let met = met(posterior, paying.iter().copied());
         self.reward.add(&met, reward);

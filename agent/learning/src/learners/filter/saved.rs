@@ -41,13 +41,13 @@ impl SavedRobot {
         }
     }
 
-    /// Whether a world's observation equals the saved one. Worlds on different servers can have equal observations if
-    /// their seeds, steps, flights and sensor noise are the same.
+    /// Whether a world's observation equals the saved observation. Worlds on different servers can have equal
+    /// observations if their seeds, steps, flights and sensor noise are the same.
     pub fn is_of(&self, observation: &Observation) -> bool {
         self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }
 
-    /// Whether any robot's observation equals its saved one.
+    /// Whether any robot's observation equals its saved observation.
     pub fn any_is_of(
         all: &BTreeMap<u32, Self>,
         robots: Range<u32>,

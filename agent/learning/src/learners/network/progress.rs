@@ -39,7 +39,7 @@ pub struct Position {
     pub track: Track,
     pub reward: RewardEstimate,
     pub iterations: u64,
-    /// The place of the last frame that the hidden vector depends on, if any.
+    /// World, step and cell of the last frame that the hidden vector depends on, if any.
     pub place: Option<Place>,
 }
 
@@ -95,7 +95,8 @@ impl Progress {
         reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
-    /// Returns the contents of a checkpoint without its settings. `rollout` provides the current follower and place.
+    /// Returns the contents of a checkpoint without its settings. `rollout` provides the network's current recurrent
+    /// state and the robot's position.
     pub fn to_contents(&self, rollout: &Rollout) -> Result<Contents, NetworkError> {
         let shape = self.autoencoder.shape();
         let frames = self.replay.frames();
@@ -219,8 +220,8 @@ fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> Ne
     }
 }
 
-/// Checks that the file contains enough values for the sizes that it declares. Otherwise, a small file could exhaust
-/// memory.
+/// Checks that the file contains enough values for the sizes that it declares. Without this check, a small file could
+/// exhaust memory.
 fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<()> {
     let expected = shape.n_numbers();
     let tensors = contents.tensors.values();

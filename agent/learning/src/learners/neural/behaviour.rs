@@ -11,11 +11,11 @@ use serde::{Deserialize, Serialize};
 /// Average number of steps between changes of behaviour.
 const STEPS: u64 = 20;
 
-/// Time constants in steps: of the value that a seen cell regains for `Cover`, and of the value that a sighting loses
-/// for `Last`.
+/// Time constants in steps: how fast a seen cell regains its value for the aim `Cover`, and how fast an old sighting
+/// loses its value for the aim `Last`.
 const FADING_STEPS: [f32; 2] = [300.0, 100.0];
 
-/// An aim, and the goal cell of the aim `Far`.
+/// An aim, and a goal cell, which only the aim `Far` uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Behaviour {
     aim: Aim,
@@ -30,7 +30,7 @@ enum Aim {
     Cover,
     /// The goal cell.
     Far,
-    /// The latest sightings of the observation with the highest reward.
+    /// Cells in which the observation with the highest reward was seen recently.
     Last,
     /// The policy's objective on the belief, plus `entropy / 10` times the belief's entropy.
     Exploit { entropy: u8 },
@@ -175,10 +175,11 @@ mod tests {
             counts[aim.expect("an aim")] += 1;
             behaviour = Some(next);
         }
-        // There are 1,000 draws, of which 8 % repeat the previous aim and goal.
+        // About 1,000 behaviours are drawn, of which 8 % equal the previous behaviour.
         assert!((850..1050).contains(&n_changes), "{n_changes}");
         for (count, (aim, chances)) in counts.iter().zip(AIMS) {
-            // Three standard deviations of a share of 1,000 draws are at most .045. Durations vary as well.
+            // Three standard deviations of a share of 1,000 draws are at most .045. The tolerance is wider, because
+            // durations vary as well.
             let off = f64::from(*count) / 20_000.0 - chances[1] as f64 / 100.0;
             assert!(off.abs() < 0.08, "{aim:?} {off}");
         }

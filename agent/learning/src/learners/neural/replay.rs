@@ -1,7 +1,8 @@
-//! A replay buffer for the neural belief: recent frames of several robots, each with all earlier sightings.
+//! A replay buffer for the neural belief: recent frames of several robots, and for each frame the *sightings* before
+//! it, which are the latest observations of every cell.
 //!
 //! A *block* contains consecutive frames of one robot. It stores the sightings before its first frame. The sightings
-//! before a later frame are computed from these and the frames in between.
+//! before a later frame are computed from the stored sightings and the frames in between.
 
 use crate::checkpoint::{check, check_numbers};
 use anyhow::Result;
@@ -37,7 +38,7 @@ pub struct LessonReplay {
     max_frames: usize,
     /// Blocks that are full or whose track has ended, oldest first.
     full: VecDeque<Block>,
-    /// The block that receives each robot's frames.
+    /// The block that receives new frames, for each robot.
     open: BTreeMap<u32, Block>,
 }
 

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
-/// Upper limit on due updates. It is above the number that one step of all worlds can add.
+/// Maximum number of updates that can be due. It exceeds the number that one step of all worlds can add.
 const MAX_EARNED: f64 = 2e6;
 
 /// A checkpoint of a neural belief, without its tensors.

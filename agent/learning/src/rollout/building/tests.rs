@@ -1,4 +1,4 @@
-//! The belief that an agent plans on, and the inputs of its decisions.
+//! Tests of the belief that an agent plans on, and of the inputs of its decisions.
 
 use super::*;
 use crate::beliefs::autoencoder::AutoencoderEstimator;
@@ -36,7 +36,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
     (states, frame)
 }
 
-/// An untrained network. The seed of its DQN is the lowest with which the DQN satisfies a condition.
+/// An untrained network. The seed of its DQN is the lowest seed with which the DQN satisfies the condition `suits`.
 fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
     let mut config = config(basis);
     config.seed = 1;

@@ -1,13 +1,14 @@
 """Beliefs about worlds: the probability of each state in each cell, given the frames so far.
 
-`known` makes a `Belief` from a model, `load` from a checkpoint. Both offer every kind of belief
-that the Rust agent has. `score` compares a belief with recorded worlds.
+`known` makes a `Belief` from a model, `load` makes one from a checkpoint. Together they offer every
+kind of belief that the Rust agent has. `score` compares a belief with recorded worlds.
 `wrappers.BeliefObservation` adds a belief to an environment.
 
-The plain kind is the Bayes filter of a known model (paper section III.A, masked as in section
-III.C). A frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5). The transition turns
-the posterior into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). The filter treats cells as
-independent given the frames, so it is an approximation even with the true model.
+The kind ``"known"`` is the Bayes filter of a known model (paper section III.A), which corrects only
+observed cells (section III.C). A frame turns the predictor ``u_k`` into the posterior ``p_k``
+(eq. 5). The transition turns the posterior into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6).
+The filter treats cells as independent given the frames, so it is an approximation even with the
+true model.
 
 Beliefs have shape (S, H, W) with S states: a distribution in each cell.
 """
@@ -85,12 +86,12 @@ class Transition:
 
     ``phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] x[n, i + a - A, j + c - C]`` with
     (A, C) the centre of the kernel (eq. 2), then divided by its sum over ``m`` (eq. 3). Outside the
-    grid ``x`` is zero. If the model has an `edge` state, ``x`` is one in that state instead.
+    grid ``x`` is zero for all states, or, if the model has an `edge` state, one for that state.
 
-    A model whose weights depend on the cell's own state ``o`` has a kernel for each ``o``. Its
-    ``phi[m | o]`` uses the kernel of ``o``, whose centre sees ``o`` itself, and
-    ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``. This is a mean field: it treats neighbours
-    as independent, as the filter does.
+    A model whose weights depend on the cell's own state ``o`` has a kernel for each ``o``.
+    ``phi[m | o]`` is computed with the kernel of ``o`` and the state ``o`` at its centre. The
+    result is ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``. This is a mean-field
+    approximation: it treats neighbours as independent, as the filter does.
 
     Threads must not share an instance, because it reuses scratch memory.
     """

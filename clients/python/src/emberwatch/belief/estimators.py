@@ -1,6 +1,6 @@
-"""Every kind of belief that the Rust agent has, with bit-identical results.
+"""All kinds of belief that the Rust agent has, with bit-identical results.
 
-`known` makes a `Belief` from a model, `load` from a checkpoint.
+`known` makes a `Belief` from a model, `load` makes one from a checkpoint.
 """
 
 from os import PathLike
@@ -40,11 +40,11 @@ def known(
     Args:
         model: A `Model`, the name of a built-in one, or the path of a model file.
         prior: The belief before the first frame: a distribution over the states in each cell, shape
-            (S, H, W), from `initial_prior` or `prior.simulated_prior` for example. Stored in single
-            precision.
-        kind: A kind of `kinds` that starts with ``"known"``, which is the Bayes filter of the
-            paper. `+second-order` and `+cavities` predict more accurately. With `+spatial`, a frame
-            also corrects the neighbours of the observed cells.
+            (S, H, W), from `initial_prior` or `prior.simulated_prior` for example. It is stored in
+            single precision.
+        kind: A kind of `kinds` whose name starts with ``"known"``. The plain ``"known"`` is the
+            paper's Bayes filter. With `+second-order` or `+cavities`, it predicts more accurately.
+            With `+spatial`, a frame also corrects the neighbours of the observed cells.
         n_worlds: Number of worlds, at least 1. None: a single world, and arrays without an axis
             for worlds.
 
@@ -117,8 +117,9 @@ class Belief:
     - Values are single precision, bit-identical to the Rust agent's. Outputs of networks may
       differ between processors.
     - Kinds with `+spatial` learn correlations between cells while they run, separately for each
-      world, so that earlier frames improve later corrections. `reset` discards them, except for
-      correlations loaded from a checkpoint, unless `keep_correlations` is true.
+      world, so that earlier frames improve later corrections. `reset` discards these correlations,
+      unless `keep_correlations` is true. It never discards correlations that were loaded from a
+      checkpoint.
 
     Only one thread at a time may use a belief.
     """
@@ -204,9 +205,9 @@ class Belief:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Scores the belief against hidden states: log loss, Brier score and accuracy.
 
-        `BeliefScores` defines the scores. Each is a number, or has shape (n_worlds,). `states` has
-        the shape and type of frames, and values below S. `target` is the value in `states` of the
-        state that pays most; None: `target_state`.
+        `BeliefScores` defines the scores. Each score is a number, or with `n_worlds` an array of
+        shape (n_worlds,). `states` has the shape and type of frames, and values below S. `target`
+        is the value in `states` of the state that pays most; None: `target_state`.
         """
         figures = self._native.scores(self._frames(states, "states"), target_of(self, target))
         losses, briers, accuracies = (self._of_worlds(figure) for figure in figures)
@@ -217,8 +218,8 @@ class Belief:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns the log-likelihood of frames under the belief, and the number of observed cells.
 
-        The log-likelihood is a sum over the observed cells. Each is a number, or has shape
-        (n_worlds,).
+        The log-likelihood is a sum over the observed cells. Each result is a number, or with
+        `n_worlds` an array of shape (n_worlds,).
         """
         sums, n_seen = self._native.score_frames(self._frames(frames, "frame"))
         return self._of_worlds(sums), self._of_worlds(n_seen)

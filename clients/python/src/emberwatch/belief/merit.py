@@ -1,6 +1,7 @@
 """Figures of merit of runs in several worlds, defined in `docs/figures-of-merit.md`.
 
-They need no model, only the number of the target state. Two of them need the hidden states.
+The figures need no model, only the index of the target state. Two figures also need the hidden
+states.
 """
 
 from dataclasses import dataclass
@@ -21,10 +22,10 @@ class Merit:
 
     #: Number of steps until a robot first visited a burning cell.
     steps_to_detection: int | None
-    #: Number of burning cells of the world in that step.
+    #: Number of the world's burning cells in the step of that first visit.
     burning_cells_at_detection: int | None
     #: Share of the burning cells that count as seen, because a robot visited them in the last
-    #: `recent_steps` steps. Mean over the steps with fire.
+    #: `recent_steps` steps. Mean over the steps in which cells burn.
     burning_seen_share: float | None
     #: Smallest number of moves from a robot to a burning cell that does not count as seen. Mean
     #: over the steps that have such a cell.
@@ -39,7 +40,7 @@ class MeritTally:
     def __init__(
         self, n_worlds: int, shape: tuple[int, int], *, target: int, recent_steps: int
     ) -> None:
-        """Starts before the first step. `target`: the burning state; `recent_steps`: at least 1."""
+        """Starts without steps. `target` is the burning state; `recent_steps` is at least 1."""
         self._tally = _native.MeritTally(n_worlds, *shape, target, recent_steps)
 
     def update(

@@ -14,7 +14,8 @@ from emberwatch.model import Model
 PriorKind = Literal["simulated", "initial", "uniform"]
 """The name of a prior, see `wrappers.BeliefObservation`."""
 
-# Tolerance of the sum of a cell's probabilities: 400 float32 roundings, as in the Rust agent.
+# Tolerance for the sum of a cell's probabilities, as in the Rust agent: the error of 400 float32
+# roundings.
 _SUM_TOLERANCE = 5e-5
 
 
@@ -52,11 +53,12 @@ def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
 
 @functools.lru_cache(maxsize=8)
 def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
-    """Returns the share of 64 simulated worlds with each cell in each state after the burn-in.
+    """Returns how often each cell is in each state after the burn-in of 64 simulated worlds.
 
-    Shape (S, H, W), read-only: calls with the same arguments share the array. The seeds of these
-    worlds are fixed and belong to no environment. The agent starts from the same prior. The first
-    call simulates for some seconds; later processes read the prior from ``~/.cache/emberwatch``.
+    The result has shape (S, H, W), and is read-only because calls with the same arguments share it.
+    The seeds of these worlds are fixed, and no environment uses them. The agent starts from the
+    same prior. The first call simulates for some seconds; later processes read the prior from
+    ``~/.cache/emberwatch``.
     """
     height = as_count(height, "height", 1, _native.MAX_SIDE)
     width = as_count(width, "width", 1, _native.MAX_SIDE)
@@ -76,7 +78,7 @@ def prior_of(
 ) -> NDArray[np.floating]:
     """Returns a prior by name, or the given array after a check of its shape.
 
-    None: ``"simulated"`` after a burn-in, ``"initial"`` without one.
+    If `prior` is None, it is ``"simulated"`` for worlds with a burn-in, otherwise ``"initial"``.
     """
     if prior is None:
         prior = "simulated" if burn_in > 0 else "initial"

@@ -33,8 +33,9 @@ class BeliefScores:
     def mean(self) -> dict[str, Any]:
         """Returns the mean of each score over the steps, by name.
 
-        Each is a number, or has shape (n_worlds,). All steps have the same weight, except in
-        `predicted_log_loss`, where all observed cells have the same weight.
+        Each mean is a number, or an array of shape (n_worlds,) for a belief about several worlds.
+        All steps have the same weight, except in `predicted_log_loss`, where all observed cells
+        have the same weight.
         """
         figures = ("log_loss", "brier", "accuracy")
         means: dict[str, Any] = {name: getattr(self, name).mean(axis=0) for name in figures}

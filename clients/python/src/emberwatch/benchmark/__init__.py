@@ -2,8 +2,8 @@
 
     rows = evaluate(policy, name="ppo", seeds=range(32), csv="ppo.csv", model="wildfire-small", ...)
 
-`emberwatch-agent compare --add ppo.csv`, with the same worlds and steps, adds the rows to its
-table, paired by world.
+`emberwatch-agent compare --add ppo.csv`, run with the same worlds and steps, adds these rows to its
+table and pairs them by world.
 """
 
 from emberwatch._native import FIRST_TRAINING_SEED as FIRST_TRAINING_SEED

@@ -1,4 +1,4 @@
-"""Digests of policies, which detect whether the rows in a file come from the same policy.
+"""Digests of policies, to detect whether rows in a file come from the same policy.
 
 Computing a digest neither pickles nor changes a value. If a value cannot be read, only the name of
 its type is hashed. Data that a function reads at run time, such as a file, is not hashed.
@@ -19,7 +19,8 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum depth and number of nested values. Beyond these, only the names of types are hashed.
+#: Maximum depth and number of nested values. Of values beyond these limits, only the names of their
+#: types are hashed.
 _DEPTH: Final = 24
 _PARTS: Final = 50_000
 
@@ -41,7 +42,7 @@ _PACKAGES: Final = frozenset(("site-packages", "dist-packages"))
 
 
 def digest(value: object) -> str:
-    """Returns 16 hexadecimal digits. Values with visible differences have different digests.
+    """Returns 16 hexadecimal digits, which differ for values that differ in a covered part.
 
     The digest of a model covers its weights. The digest of a function covers its code, defaults,
     closure, and the globals that it names. The digest of another object covers its attributes:
@@ -109,7 +110,7 @@ class _Walk:
             return self._all("partial", (given.func, given.args, given.keywords), depth)
         if isinstance(value, type):
             return self._all(_name(value), (_of_class(value), value.__bases__), depth)
-        # The result of a decorator, for example one that compiles or caches.
+        # The value may come from a decorator, for example one that compiles or caches a function.
         wrapped = getattr(value, "__wrapped__", None)
         return self._all("object", (kind, wrapped, _of_object(value)), depth)
 
@@ -223,7 +224,7 @@ def _numbers(module: object) -> dict[str, object]:
 
 
 def _attributes(state: object) -> Iterable[tuple[str, object]]:
-    """Yields the attributes in a state of `object.__getstate__`, from `__dict__` and slots."""
+    """Yields the attributes that `object.__getstate__` returned, from `__dict__` and from slots."""
     parts = cast("tuple[object, ...]", state) if isinstance(state, tuple) else (state,)
     for part in parts:
         if isinstance(part, dict):
@@ -236,7 +237,7 @@ def _is_data(value: object) -> bool:
 
 
 def _is_installed(module: object) -> bool:
-    """Returns whether code belongs to a library or this package, where names identify it."""
+    """Returns whether code belongs to a library or this package, so that its name identifies it."""
     root = str(module).partition(".")[0]
     file = getattr(sys.modules.get(str(module)), "__file__", None)
     if not isinstance(file, str):

@@ -45,7 +45,8 @@ _BURN_IN: Final = 25_000
 _SEEDS: Final = range(8)
 _STEPS: Final = 1500
 
-#: Default timeout, seconds. Longer than a learner's, as a busy machine may delay hidden states.
+#: Default timeout, seconds. Longer than the default for learners, because hidden states can arrive
+#: late on a busy machine.
 _TIMEOUT: Final = 30.0
 
 #: Keywords of the environment that an evaluation sets itself.
@@ -74,11 +75,12 @@ def evaluate(
     Args:
         policy: A function that maps stacked observations of several worlds to their actions, or a
             model of Stable-Baselines3 or another object with the same `predict`. Recurrent models
-            receive their state back, and `episode_start` is true in the first step of each world. A
-            function or `predict` with a parameter `action_masks` receives the masks of the worlds,
-            `(n_worlds, 4)` booleans. If a model was trained behind `VecNormalize` and still has it
-            (`get_vec_normalize_env`), its observations are normalized. If the policy has a method
-            `begin(n_worlds)`, it is called before each batch of worlds.
+            receive the state that they last returned, and `episode_start` is true in the first step
+            of each world. A function or `predict` with a parameter `action_masks` receives the
+            masks of the worlds, `(n_worlds, 4)` booleans. If a model was trained behind
+            `VecNormalize` and still refers to it (`get_vec_normalize_env`), its observations are
+            normalized in the same way. If the policy has a method `begin(n_worlds)`, it is called
+            before each batch of worlds.
         name: The policy's name in the table.
         seeds: The seeds of the worlds; None: the test seeds of the task, or 0 to 7. Seeds below
             1000 are test worlds.
@@ -91,22 +93,22 @@ def evaluate(
         deterministic: Argument of `predict`.
         batch: Number of worlds to simulate at the same time, in the order of the seeds.
         recent_steps: Number of steps for which a cell counts as seen after a visit, in the figures
-            of merit. Figures that need the hidden states are None with `truth=False`. They are also
-            None if a running server does not publish the states, or hides its model or its
+            of merit. Figures that need the hidden states are None with `truth=False`. These figures
+            are also None if a running server does not publish the states, or hides its model or its
             description of recorded worlds.
-        wrap: A function that wraps the worlds, a `VecEnv` of Stable-Baselines3, as the training
-            did: `lambda worlds: VecFrameStack(worlds, 4)`. For a saved model with normalized
+        wrap: A function that wraps the worlds (a `VecEnv` of Stable-Baselines3) as in the training,
+            for example `lambda worlds: VecFrameStack(worlds, 4)`. For a saved model with normalized
             observations: `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`. The
-            evaluation does not change the statistics.
+            evaluation does not change the statistics of the normalization.
         csv: A file to write rows to. Several processes may write to it. Rows of this policy in the
-            file are reused instead of run again if worlds, settings and policy are the same. Models
-            are compared by their weights, functions by their code and the values that they refer
-            to. Rows that differ are run again and replaced. Rows of other policies are kept. A file
-            with rows of other worlds is refused.
+            file are reused if worlds, settings and policy are the same. Models are compared by
+            their weights, functions by their code and the values that they refer to. Rows of this
+            policy with other settings are computed again and replaced. Rows of other policies are
+            kept. A file with rows of other worlds is refused.
         progress: The stream for progress and for notes on reused rows; None: no output.
         keywords: Keywords of the environment, such as `task`, `model`, `height`, `n_moves` and
-            `observation`. With `robots`, the policy acts for all robots of each world, and each
-            row of its observations and actions is one robot.
+            `observation`. With several `robots`, the policy acts for all robots of each world, and
+            each row of its observations and actions belongs to one robot.
 
     Returns:
         One row for each seed, in order.
@@ -215,7 +217,8 @@ class _Setting:
     keywords: dict[str, Any]
     n_robots: int
     wrap: Callable[[Any], Any] | None
-    #: Identifies the worlds. None if rows are not written to a file, which would need it.
+    #: Identifies the worlds. None if no rows are written to a file, because only rows in files need
+    #: it.
     fingerprint: str | None = None
 
     @contextmanager
@@ -272,7 +275,7 @@ def _policy_fingerprint(setting: _Setting, *acts_on: object) -> str:
     """Returns a hash of everything that the actions depend on, except the worlds."""
     keywords = setting.keywords
     others = {it: keywords[it] for it in keywords if it not in WorldArguments.__annotations__}
-    # With a server that hides its model, `model` is the model of the belief.
+    # If the server hides its model, `model` is the model that the belief uses.
     model = keywords.get("model") if keywords.get("instance") is not None else None
     known = None if model is None else Model.named(model).toml
     return digest((VERSION, setting.env, others, known, setting.wrap, acts_on))

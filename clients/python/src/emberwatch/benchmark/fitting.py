@@ -10,7 +10,7 @@ from emberwatch.errors import InvalidArgumentError
 def fits(expected: Any, seen: Any) -> bool:
     """Returns whether a Stable-Baselines3 model for the space `expected` accepts the space `seen`.
 
-    Images may have their channels last in `seen`, as the model itself moves them first.
+    Images may have their channels last in `seen`, because the model itself moves them to the front.
     """
     if isinstance(expected, spaces.Dict) and isinstance(seen, spaces.Dict):
         parts, others = _parts(expected), _parts(seen)

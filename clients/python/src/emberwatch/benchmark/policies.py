@@ -27,8 +27,8 @@ _STARTS: Final = "episode_start"
 _DETERMINISTIC: Final = "deterministic"
 _MASKS: Final = "action_masks"
 
-#: The name of `episode_start` in SB3 before 1.4. It has this meaning only together with the other
-#: parameters of SB3's `predict`.
+#: The name of `episode_start` in SB3 before 1.4. A parameter `mask` has this meaning only next to
+#: the other parameters of SB3's `predict`.
 _OLD_STARTS: Final = "mask"
 _OLD: Final = frozenset((_STATE, _OLD_STARTS, _DETERMINISTIC))
 
@@ -40,7 +40,7 @@ class Normalizer(Protocol):
 
 
 class Actor:
-    """A policy that acts in one batch of worlds after another, and its state in the current one."""
+    """A policy that acts in one batch of worlds after another, with its state in this batch."""
 
     def __init__(self, policy: object, *, deterministic: bool, is_wrapped: bool) -> None:
         """Determines the parameters of the policy.
@@ -49,7 +49,7 @@ class Actor:
             policy: A function, or an object with `predict`.
             deterministic: Argument of `predict`.
             is_wrapped: Whether observations pass through the wrappers of the policy's training.
-                If not, they are normalized here if the model has a `VecNormalize`.
+                If False, they are normalized here, provided that the model has a `VecNormalize`.
         """
         predict = getattr(policy, "predict", None)
         self._call: Any = policy if predict is None else predict
@@ -137,7 +137,7 @@ def statistics(normalizer: Normalizer) -> dict[str, Any]:
 
 
 def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], set[str]]:
-    """Returns the names of the arguments to pass to a policy, and of the ones without a default."""
+    """Returns the names of the arguments that a policy takes, and which of them have no default."""
     try:
         parameters = list(inspect.signature(call).parameters.values())
     except (TypeError, ValueError):  # written in C

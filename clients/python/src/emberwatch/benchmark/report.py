@@ -32,7 +32,7 @@ class Progress:
         self._begin = self._last = time.monotonic()
 
     def found(self, file: Path, *, n_kept: int, n_again: int, n_dropped: int) -> None:
-        """Reports how many rows of this policy's name in the file are reused, rerun or removed."""
+        """Reports how many rows with this name in the file are reused, rerun or removed."""
         if n_kept:
             self._say(
                 f"{n_kept} {_plural('row', n_kept)} kept in {file}, not run again. Data that the "

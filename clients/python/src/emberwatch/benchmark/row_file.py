@@ -34,7 +34,7 @@ class Mark(NamedTuple):
 
     @classmethod
     def of(cls, row: Row) -> Self:
-        """Returns the mark of a row."""
+        """Returns these properties of a row."""
         return cls(row.worlds_fingerprint, row.policy_fingerprint, row.steps, row.recent_steps)
 
 
@@ -47,7 +47,7 @@ class Kind(NamedTuple):
 
     @classmethod
     def of(cls, row: Row) -> Self:
-        """Returns the kind of a row."""
+        """Returns the policy of a row and its kind of team."""
         return cls(row.policy, row.robots, row.team)
 
 
@@ -57,9 +57,9 @@ class Found:
 
     #: Rows with the same worlds, policy and settings, by seed.
     kept: dict[int, Row]
-    #: Rows of the policy's name, but from another policy, other settings or other worlds.
+    #: Rows with the policy's name that come from another policy, other settings or other worlds.
     stale: tuple[Row, ...]
-    #: In a cache: other policies with rows on other worlds, or on unknown worlds.
+    #: If the file is a cache: names of other policies whose rows are on other or unknown worlds.
     elsewhere: tuple[str, ...]
 
 
@@ -74,8 +74,9 @@ class RowFile:
 
         Args:
             path: The file, which may be missing or empty.
-            is_cache: Whether to accept rows on other worlds. If so, rows of the policy are
-                replaced, and rows of other policies stay. Otherwise, both are refused.
+            is_cache: Whether to accept rows on other worlds. If so, such rows of the policy are
+                replaced, and such rows of other policies stay. Otherwise, a file with such rows is
+                refused.
         """
         if not isinstance(path, str | os.PathLike):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise invalid("csv", "the path of a file", repr_of(path))
@@ -84,7 +85,7 @@ class RowFile:
         self._is_cache: Final = is_cache
         self._kind: Kind | None = None
         self._mark: Mark | None = None
-        #: Marks of the policy's rows that new rows replace.
+        #: Marks of the policy's rows that new rows will replace.
         self._stale: set[Mark] = set()
         self._rows: list[Row] = []
         self._is_new = False
@@ -97,7 +98,7 @@ class RowFile:
             try:
                 with self._locked():
                     self._rows = read(self.path)
-                    # Detects a folder that refuses new files before the work instead of after it.
+                    # Detects a folder without write access now, instead of after the evaluation.
                     self._temporary.touch()
                     self._temporary.unlink()
             except OSError:
@@ -116,7 +117,7 @@ class RowFile:
             self._remove_empty()
 
     def find(self, kind: Kind, mark: Mark) -> Found:
-        """Finds the rows of a policy, to which `add` adds more.
+        """Finds the rows of a policy in the file, and selects this policy for `add`.
 
         Raises:
             InvalidArgumentError: If the file is not a cache, and has rows of other worlds, or rows
@@ -135,7 +136,7 @@ class RowFile:
         return Found(kept, stale, tuple(sorted(elsewhere)))
 
     def add(self, rows: Sequence[Row]) -> None:
-        """Adds rows, and drops all rows of the policy with another mark.
+        """Adds rows, and drops all rows of the policy whose mark differs.
 
         Raises:
             InvalidArgumentError: If another process has meanwhile written conflicting rows, or if

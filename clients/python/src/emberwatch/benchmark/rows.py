@@ -21,7 +21,8 @@ class Row:
 
     #: Name of the policy.
     policy: str
-    #: Name of the estimator of its belief: `none`, `known_model`, or a name of your choice.
+    #: Name of the estimator of the policy's belief: `none`, `known_model`, or a name of your
+    #: choice.
     estimator: str
     world_seed: int
     #: Number of scored steps.
@@ -32,24 +33,26 @@ class Row:
     mean_distinct_cells: float
     #: Share of the distinct visited cells that were in the state that pays most.
     hit_rate: float
-    #: Mean number of cells of the whole world in that state: the same for every policy.
+    #: Mean number of cells of the whole world in the state that pays most, the same for all
+    #: policies.
     mean_fire_cells: float
-    #: Mean time that the policy took for the actions of a step, milliseconds.
+    #: Mean time that the policy took to choose the actions of a step, milliseconds.
     mean_plan_millis: float
-    #: Brier score of the belief. Empty in rows of Python: only the agent program scores beliefs.
+    #: Brier score of the belief. Empty in rows that Python writes, because only the agent program
+    #: scores beliefs.
     brier: str
-    #: Moves of a path.
+    #: Number of moves in a path.
     moves: int
-    #: Robots of the world. The values above are for all robots together.
+    #: Number of robots in the world. The values above are for all robots together.
     robots: int = 1
     #: What the robots share: `alone` (nothing), `shared` (what they see), or a word of your choice.
     team: str = "alone"
     #: Share of the visits that went to cells which another robot visited in the same step.
     mean_repeated: float = 0.0
     #: The first of the figures of merit (docs/figures-of-merit.md): number of steps until a robot
-    #: first visited a burning cell. None: never, or a row of an old file.
+    #: first visited a burning cell. None if no robot ever did, and in rows of old files.
     steps_to_detection: int | None = None
-    #: Number of burning cells of the world in that step.
+    #: Number of the world's burning cells in the step of that first visit.
     burning_cells_at_detection: int | None = None
     #: Number of steps for which a cell counts as seen after a visit.
     recent_steps: int | None = None
@@ -59,7 +62,7 @@ class Row:
     front_distance: float | None = None
     #: Share of the grid that a robot visited at any time.
     grid_seen_share: float | None = None
-    #: Mean of ln P(y) over the observations y of visited cells. None in rows of Python.
+    #: Mean of ln P(y) over the observations y of visited cells. None in rows that Python writes.
     log_likelihood: float | None = None
     #: Identifies the worlds apart from their seeds. Equal for two rows if and only if model, grid,
     #: moves, robots, sensor, start and burn-in are equal. Empty in rows of old files.
@@ -71,7 +74,7 @@ class Row:
 
 
 _HEADER: Final = [field.name for field in fields(Row)]
-#: The first column of each group that releases have added at the end, newest first.
+#: The first column of each group of columns that a release added at the end, newest first.
 _LATER: Final = (
     "training_seconds",
     "worlds_fingerprint",
@@ -110,7 +113,7 @@ def write(file: TextIO, rows: Iterable[Row]) -> None:
 
 
 def _row(line: dict[Any, Any]) -> Row:
-    if None in line or None in line.values():  # the key None has values without a column
+    if None in line or None in line.values():  # the key None holds surplus values
         raise ValueError(f"a row with too many or too few values: {list(line.values())}")
     kinds: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "str": str}
 

@@ -21,7 +21,7 @@ from emberwatch.sb3 import WildfireVecEnv
 
 
 class Wrapped:
-    """Worlds whose observations pass through wrappers, which never see an episode end."""
+    """Worlds whose observations pass through wrappers. The wrappers never see an episode end."""
 
     def __init__(self, worlds: Any, wrap: Callable[[VecEnv], VecEnv]) -> None:
         """Wraps the worlds, and freezes the statistics of each `VecNormalize`.
@@ -80,11 +80,11 @@ class _ScoredVecEnv(WildfireVecEnv):
 
 
 def _fix(normalize: VecNormalize) -> None:
-    """Freezes the statistics of a training; refuses a `VecNormalize` without statistics."""
+    """Freezes the statistics of the training; refuses a `VecNormalize` without statistics."""
     normalize.training = normalize.norm_reward = False
     rms = normalize.obs_rms if normalize.norm_obs else {}
     parts = rms.values() if isinstance(rms, dict) else [rms]
-    # A new `VecNormalize` begins with a count far below 1.
+    # The count of a new `VecNormalize` is far below 1.
     if any(part.count < 1.0 for part in parts):
         raise InvalidArgumentError(
             "wrap: VecNormalize has no statistics: save the training's statistics with its `save`, "

@@ -1,4 +1,4 @@
-"""Clients: connections that fly robots, observe worlds and store them in files.
+"""Clients: connections that fly robots, observe worlds and store worlds in files.
 
 `connect` returns a `Client`, `Client.acquire` a `Lease`, and `Lease.step` a `StepAnswer`. Every
 call waits at most `timeout` seconds for its answer. All returned arrays are copies.
@@ -39,7 +39,7 @@ _log: Final = logging.getLogger("emberwatch")
 #: Milliseconds without use after which a lease on worlds in this process expires.
 _EMBEDDED_LEASE: Final = 86_400_000
 
-#: Seconds to sleep after the first attempt to connect, and maximum between later attempts.
+#: Seconds to sleep after the first attempt to connect, and maximum sleep between later attempts.
 _FIRST_RETRY: Final = 0.005
 _RETRY: Final = 0.2
 
@@ -59,7 +59,7 @@ class Client(ServerConnection):
         ttl: float | None = None,
         timeout: float = RESET_TIMEOUT,
     ) -> Lease:
-        """Acquires the right to fly consecutive robots. Waits until their worlds end their burn-in.
+        """Acquires the right to fly consecutive robots. Waits for the end of their worlds' burn-in.
 
         Robot r of world w has number w R + r, with R = `info.n_robots`. To resume an episode that
         another agent left, continue from `lease.observe()`, which returns k, the robot's cell and
@@ -75,7 +75,7 @@ class Client(ServerConnection):
 
         Raises:
             EmberwatchError: With code `"busy"` if another client holds one of the robots, or
-                `"no_such_robot"`.
+                `"no_such_robot"` if one does not exist.
         """
         request = {
             "op": "acquire",
@@ -204,14 +204,14 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
     """Creates worlds inside this process, without a server, and returns a `Client` of them.
 
     No other process can observe these worlds or fly in them, and closing the client ends them.
-    Results that depend only on seeds and actions are byte for byte a server's. Leases expire a day
-    after their last use. Ctrl-C interrupts the wait for a reset or a file; during a step it takes
-    effect after the step.
+    Results that depend only on seeds and actions are byte for byte the same as from a server.
+    Leases expire a day after their last use. Ctrl-C interrupts the wait for a reset or a file;
+    during a step it takes effect after the step.
 
     Args:
         settings: Settings of `config/server.toml`, such as `worlds=4`, `task="small"`, `seed=7`;
-            None: the default. `instance` and the settings of the server's own snapshots do not
-            apply.
+            None: the default. The setting `instance` and the settings for a server's own snapshots
+            do not apply here.
 
     Raises:
         InvalidArgumentError: If a setting is unknown or invalid.
@@ -227,7 +227,7 @@ def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
 
     Callers that have checked the settings pass False, because the check has already warned.
     """
-    # No other client waits for these robots.
+    # The lease may be long, because no other client waits for these robots.
     chosen: dict[str, object] = {"lease_millis": _EMBEDDED_LEASE}
     for name, given in settings.items():
         if given is not None:
@@ -236,7 +236,7 @@ def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:
-    """Retries a connection for `wait` seconds until a server answers; logs once that it waits."""
+    """Tries to connect for up to `wait` seconds, at least once; logs once that it waits."""
     deadline, waits, pause = time.monotonic() + wait, False, _FIRST_RETRY
     while True:
         try:

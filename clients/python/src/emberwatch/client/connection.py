@@ -76,7 +76,7 @@ class ServerConnection(Connection):
         team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """Returns the results and frames of the last step again. Needs no lease, changes nothing.
+        """Returns results and frames of the last step again. Needs no lease and changes nothing.
 
         Args:
             first_robot: The number of the first robot.

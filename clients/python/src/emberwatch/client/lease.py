@@ -22,8 +22,8 @@ _BELIEF_PART: Final = 1 << 19
 class Lease:
     """The right to fly consecutive robots. It ends with `release`, or on leaving its `with` block.
 
-    For each world, the lease remembers the step k that it last stepped to, reset to or observed. A
-    path is for step k + 1, and the server flies it in no other step.
+    For each world, the lease remembers the step k that it last stepped to, reset to or observed.
+    The next path is for step k + 1, and the server flies it in no other step.
     """
 
     def __init__(
@@ -74,7 +74,8 @@ class Lease:
             RequestTimeoutError: If no answer arrives; `observe` shows whether the step was made.
             ServerGoneError: If the server ended.
             EmberwatchError: With code `"late"` if the world moved on without this path; `observe`
-                shows to which step. With code `"episode_over"`: reset that world.
+                shows to which step. With code `"episode_over"` if the episode has ended: reset that
+                world.
         """
         place = self._place(robots, full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES)
         answer = self.native.step(paths, *place, timeout)
@@ -95,21 +96,22 @@ class Lease:
         """Flies one path with each robot as `step` does, but waits as long as teammates take.
 
         After each timeout it observes whether the worlds have moved, and sends the paths again if
-        not. It waits as long as the server answers. If another thread's paths moved a world, the
-        world counts as moved on without these paths.
+        not. It keeps waiting as long as the server answers. A world that another thread's paths
+        moved counts as having moved on without these paths.
 
         Args:
             paths: As in `step`.
             robots: As in `step`.
             accepts_late: Whether to return the current results of a world that moved on without
                 these paths, instead of raising the error with code `"late"`.
-            timeout: Seconds until `fly` observes, plus the server's own deadline for teammates.
+            timeout: Seconds to wait before each check whether the worlds have moved. The server's
+                own deadline for teammates is added.
 
         Returns:
             The results and frames, and the number of earlier world steps that went unobserved.
 
         Raises:
-            RequestTimeoutError: If the server does not answer the observation either.
+            RequestTimeoutError: If the server does not answer such a check either.
             EmberwatchError: As in `step`.
         """
         place = self._all if robots is None else self._place(robots, 0)[:2]
@@ -157,7 +159,8 @@ class Lease:
         No other client may hold robots of these worlds.
 
         Args:
-            seeds: One seed for each world; None: the server derives it from the world's last seed.
+            seeds: One seed for each world; None: the server derives each seed from the world's last
+                seed.
             worlds: The worlds to reset; None: all worlds of the lease.
             timeout: Seconds to wait for the answer.
 
@@ -175,7 +178,9 @@ class Lease:
         first: int = 0,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Replaces worlds of the lease with worlds of a snapshot file, which then continue exactly.
+        """Replaces worlds of the lease with worlds from a snapshot file.
+
+        The restored worlds continue exactly as the saved ones would have.
 
         Args:
             path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
@@ -216,7 +221,7 @@ class Lease:
         """Stores a belief about the current step for a robot's next client; see `Client.belief`.
 
         Args:
-            result: The robot's last result. The server refuses results of any but the current step.
+            result: The robot's last result. The server refuses a result of an earlier step.
             kind: The format of the bytes, for other agents. At most 256 bytes.
             data: At most 32,768 bytes plus 76 per cell; more if the model has over 18 states.
             robot: The robot's number; None: the first robot of the lease.

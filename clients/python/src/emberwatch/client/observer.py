@@ -1,7 +1,7 @@
 """Observers of an instance: readers of frames, hidden states and beliefs.
 
 For example `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.reward)`. An
-observer may start before the server, and outlives it.
+observer may be opened before the server starts, and stays open when the server ends.
 """
 
 import time
@@ -31,7 +31,7 @@ class RobotFrame:
     result: RobotResult
     #: The robot's frame, `(H, W)`: the observed value of each cell, 255 in unobserved cells.
     frame: NDArray[np.uint8]
-    #: The moves that the robot flew, `(n_moves,)`; empty after a reset, or if it hovered.
+    #: The moves that the robot flew, `(n_moves,)`; empty after a reset, or if the robot hovered.
     path: NDArray[np.uint8]
 
 
@@ -44,7 +44,7 @@ class Frame:
     result: WorldResult
     #: One entry for each robot of the world.
     robots: tuple[RobotFrame, ...]
-    #: Number of samples that this observer missed since its last one.
+    #: Number of samples that this observer missed since the last one that it received.
     n_lost: int
 
     @property
@@ -72,7 +72,7 @@ class Truth:
     seed: int
     #: The hidden states X_k, `(H, W)`; a copy.
     states: NDArray[np.uint8]
-    #: Number of samples that this reader missed since its last one.
+    #: Number of samples that this reader missed since the last one that it received.
     n_lost: int
 
     @property
@@ -109,7 +109,7 @@ class Outlook:
     pid: int
     #: The numbers of the robots that the agent flies.
     robots: range
-    #: Number of this agent's samples that this reader missed since its last one.
+    #: Number of this agent's samples that this reader missed since the last one that it received.
     n_lost: int
 
 
@@ -150,7 +150,7 @@ class Observer(Reader[Frame]):
     def __iter__(self) -> Iterator[Frame]:
         """Yields frames as they arrive, until none arrives for `timeout` seconds (None: never)."""
         while True:
-            # Waits an hour at a time: an infinite wait would overflow.
+            # Waits an hour at a time, because an infinite wait would overflow.
             frame = self.receive(3600.0 if self._timeout is None else self._timeout)
             if frame is not None:
                 yield frame
@@ -276,7 +276,7 @@ def observe(
 
 
 def frame_of(fields: dict[str, Any]) -> Frame:
-    """Makes a `Frame` of the fields of a sample."""
+    """Makes a `Frame` from the fields of a sample."""
     fields["result"] = WorldResult(*fields["result"])
     fields["robots"] = tuple(
         RobotFrame(result=RobotResult(*result), frame=frame, path=path)

@@ -43,8 +43,8 @@ def read(
 ) -> Iterator[Record]:
     """Reads a recording. Yields its frames and hidden states in order.
 
-    The hidden states of a step come before its frame. They are for evaluation and pictures, never
-    for learners.
+    The hidden states of a step come before its frame. Hidden states are for evaluation and
+    pictures, never for learners.
 
     Args:
         path: The file.

@@ -26,7 +26,7 @@ class RecordedWorld:
     description: str | None
     #: Number of recorded sequences.
     n_sequences: int
-    #: Steps of the shortest episode.
+    #: Number of steps of the shortest episode.
     n_steps: int
 
 
@@ -43,10 +43,10 @@ class ServerInfo:
     height: int
     #: Columns of the grid.
     width: int
-    #: Moves of a path, T.
+    #: Number of moves in a path, T.
     n_moves: int
     n_worlds: int
-    #: Robots of each world, R: robot r of world w has number w R + r.
+    #: Number of robots in each world, R. Robot r of world w has number w R + r.
     n_robots: int
     #: Number of observed values, O.
     n_observations: int
@@ -54,9 +54,9 @@ class ServerInfo:
     observations: tuple[str, ...]
     #: The model as TOML text; None if the server hides it or its worlds were recorded.
     model: str | None
-    #: Steps that a world is simulated before k = 0.
+    #: Number of steps that a world is simulated before k = 0.
     burn_in: int
-    #: Steps until an episode is truncated; 0: never.
+    #: Number of steps after which an episode is truncated; 0: never.
     max_steps: int
     max_clients: int
     #: Which cells a step observes: "path", "full" or "client" (the client decides in each step).
@@ -65,8 +65,8 @@ class ServerInfo:
     publish_truth: bool
     #: Default time without use after which a lease expires, milliseconds.
     lease_millis: int
-    #: How long a step waits for the other robots after its first path, milliseconds; 0: as long as
-    #: other clients hold them.
+    #: Time that a step waits for the paths of other robots after the first path arrived,
+    #: milliseconds; 0: as long as other clients hold these robots.
     deadline_millis: int
     #: Name of the task that defines the worlds; None: no task.
     task: str | None = None
@@ -84,7 +84,7 @@ class ServerInfo:
 
     @property
     def recorded_states(self) -> Description | None:
-        """The description of recorded states; None if worlds are simulated, or it is hidden."""
+        """The description of recorded states; None if there are none, or the server hides it."""
         text = None if self.recorded_world is None else self.recorded_world.description
         return None if text is None else Description.from_toml(text)
 
@@ -160,13 +160,13 @@ class LeftBeliefInfo:
 
 
 class LeftBelief(NamedTuple):
-    """A belief about a world that an agent left for the next agent."""
+    """A belief that an agent left for the next agent of its world."""
 
     #: The format of the bytes.
     kind: str
     #: Number of resets of the world since the server started.
     episode: int
-    #: The step k that the belief is about: the current one.
+    #: The step k that the belief is about, which is the world's current step.
     step: int
     data: bytes
 

@@ -19,7 +19,7 @@ RECALL: Final = 3
 FULL_COVERAGE: Final = 1
 TEAM_FRAMES: Final = 2
 
-#: Maximum number of samples that a reader of hidden states can lag behind.
+#: Maximum number of samples by which a reader of hidden states can lag behind.
 TRUTH_BUFFER: Final = 128
 
 
@@ -28,14 +28,15 @@ class WorldResult(NamedTuple):
 
     #: k, the number of steps since the last reset.
     step: int
-    #: Seed of the episode. Seed and model determine the hidden states: not for learners.
+    #: Seed of the episode. Learners must not use it, because seed and model determine the hidden
+    #: states.
     seed: int
     #: Number of resets of this world since the server started.
     episode: int
     #: Reward of the team: the sum of the model's rewards over all distinct cells that its robots
     #: visited.
     reward: float
-    #: Bit r is 1 if no client held robot r, which hovered.
+    #: Bit r is 1 if robot r hovered, because no client held it.
     hovered: int
     #: Bit r is 1 if robot r was held, but its path came too late.
     late: int
@@ -43,7 +44,7 @@ class WorldResult(NamedTuple):
     n_target_cells: int
     #: Number of distinct cells that the team visited.
     n_visited: int
-    #: Number of these cells that were in the state that pays most.
+    #: Number of distinct visited cells that were in the state that pays most.
     n_hits: int
     #: 1 if the episode ended by itself.
     terminated: int
@@ -65,7 +66,7 @@ class RobotResult(NamedTuple):
     marginal: float
     #: Number of distinct cells that the robot visited.
     n_visited: int
-    #: Number of these cells that were in the state that pays most.
+    #: Number of distinct visited cells that were in the state that pays most.
     n_hits: int
     #: The cell where the robot's path began.
     start_row: int
@@ -109,7 +110,7 @@ RESULT_DTYPE: Final = np.dtype([("world", WORLD_DTYPE), ("robot", ROBOT_DTYPE)])
 class Shape(NamedTuple):
     """The sizes that determine the layout of answers, from the reply to `hello`."""
 
-    #: Robots of a world, R.
+    #: Number of robots in a world, R.
     n_robots: int
     height: int
     width: int

@@ -19,7 +19,7 @@ _Value = TypeVar("_Value")
 
 
 def check_settings(settings: Mapping[str, object]) -> dict[str, Any]:
-    """Checks settings; returns them with all defaults, by their names in `config/server.toml`.
+    """Checks settings; returns all settings and defaults by their names in `config/server.toml`.
 
     Raises:
         InvalidArgumentError: If a server would refuse them.
@@ -39,7 +39,7 @@ def as_setting(name: str, value: object) -> bool | int | str:
 
 
 def as_seed(seed: object) -> int:
-    """Checks a world's seed: an integer of Python, NumPy or another library, below 2**64."""
+    """Checks that a world's seed is an integer below 2**64, of Python, NumPy or another library."""
     number = as_integer(seed)
     if number is not None and 0 <= number < 2**64:
         return number
@@ -52,7 +52,7 @@ def as_integer(value: object) -> int | None:
         return int(cast("int", value))
     try:
         return None if _is_masked(value) else operator.index(cast("SupportsIndex", value))
-    except Exception:  # any type: libraries differ on arrays on a GPU, or with several elements
+    except Exception:  # libraries raise different errors, for example for arrays on a GPU
         return None
 
 
@@ -74,7 +74,7 @@ def as_flag(value: object, subject: str) -> bool:
 def as_seeds(
     seeds: Iterable[int | None] | None, worlds: Iterable[int]
 ) -> list[dict[str, int | None]]:
-    """Checks the seeds of a reset, one for each world; returns the entries of its request."""
+    """Checks the seeds of a reset, one for each world; returns the entries for its request."""
     chosen = list(worlds)
     given = [None] * len(chosen) if seeds is None else as_list(seeds, "seeds")
     if len(given) != len(chosen):
@@ -89,7 +89,7 @@ def as_list(values: Iterable[_Value], subject: str) -> list[_Value]:
     """Converts an argument with one value for each world to a list."""
     try:
         return list(values)
-    except Exception as error:  # any type, as in `as_array`
+    except Exception as error:  # of any type, as in `as_array`
         got = f"{type(values).__name__}: {error}"
         raise invalid(subject, "one for each world", got) from None
 
@@ -102,7 +102,7 @@ def as_array(value: object, subject: str, expected: str) -> NDArray[Any]:
         return np.asarray(value)
     try:
         given = np.asarray(value)
-    except Exception as error:  # any type, for example for an array on a GPU
+    except Exception as error:  # of any type, for example for an array on a GPU
         raise invalid(subject, expected, f"{type(value).__name__}: {error}") from None
     is_sequence = isinstance(value, list | tuple)
     if any(map(_is_masked, cast("list[object]", value))) if is_sequence else _is_masked(value):
@@ -123,7 +123,7 @@ def repr_of(value: object) -> str:
 
 
 def as_json(value: object) -> Any:
-    """Converts a keyword's value to JSON for `spec.to_json`, which Minari calls."""
+    """Converts a keyword's value to a form that `spec.to_json` can write, as Minari requires."""
     if isinstance(value, PathLike):
         return fspath(cast("PathLike[str]", value))
     if isinstance(value, np.generic | np.ndarray):

@@ -1,4 +1,4 @@
-"""Conversion of paths between Python's text and the bytes that other programs use."""
+"""Conversion of file paths between Python's text and the UTF-8 that other programs use."""
 
 import os
 import sys
@@ -6,12 +6,12 @@ from typing import Final
 
 from emberwatch.errors import invalid
 
-#: Character that editors on Windows write before UTF-8 text.
+#: Character that editors on Windows write at the beginning of UTF-8 text.
 BYTE_ORDER_MARK: Final = "\ufeff"
 
 
 def utf8(subject: str, path: str | os.PathLike[str]) -> str:
-    """Checks a path, and converts it to UTF-8 in any locale, as other programs and GDAL read it."""
+    """Checks a path, and converts it to UTF-8, which GDAL and other programs read in any locale."""
     try:
         text = os.fsencode(path).decode()
     except TypeError:

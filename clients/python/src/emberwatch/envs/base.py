@@ -51,7 +51,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._path: NDArray[np.intp] | None = None
 
     def render(self) -> Any:
-        """Draws the last frame, path and robot, next to the hidden states if they are revealed."""
+        """Draws the last frame, path and robot; next to them the hidden states, if revealed."""
         if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
@@ -60,7 +60,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
     def close(self) -> None:
         self._session.close()
         self._view.close()
-        self._answer = None  # it cannot be copied or pickled
+        self._answer = None  # an answer cannot be copied or pickled
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
         """Begins an episode, or continues the world's current one."""
@@ -79,7 +79,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return answer
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
-        """Updates the observations with an empty frame for each missed step, then with `answer`."""
+        """Updates the observations with one empty frame per missed step, then with `answer`."""
         if self._robot is not None:
             stayed = int(answer.robots["n_moves"][0]) == 0
             self._n_missed = self._session.n_skipped + stayed
@@ -93,12 +93,12 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return self._session.teams(answer) if is_needed else None
 
     def _trace(self, answer: StepAnswer, path: NDArray[np.uint8]) -> None:
-        """Stores the cells of a flown path for pictures."""
+        """Stores the cells of a path that was flown, for pictures."""
         robot = answer.result().robot
         self._path = fly(robot.start, path[: robot.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, step: int, n_visited: int) -> dict[str, Any]:
-        """Returns the info of a step. It never has the seed, which reveals the hidden states."""
+        """Returns the info of a step, never with the seed, which reveals the hidden states."""
         info: dict[str, Any] = {"step": step, "n_visited": n_visited}
         if self._robot is not None:
             info["n_missed"] = self._n_missed
@@ -122,7 +122,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
 
 
 def check_reward(reward: str, *more: str) -> int:
-    """Returns the index of a reward in `REWARDS`; rewards in `more` have the index of `"share"`."""
+    """Returns the index of a reward in `REWARDS`, or for a reward in `more`, of `"share"`."""
     if reward not in (*REWARDS, *more):
         expected = ", ".join(map(repr, (*REWARDS, *more)))
         raise invalid("reward", f"one of {expected}", repr(reward))

@@ -23,11 +23,11 @@ class LastSeen:
     def __init__(self, n_rows: int, height: int, width: int, n_observations: int) -> None:
         self._known = np.arange(n_observations, dtype=np.uint8)
         self._values = np.full((n_rows, height, width), wire.UNOBSERVED, np.uint8)
-        #: Steps since each cell was observed, at most `MAX_AGE`.
+        #: Number of steps since each cell was observed, at most `MAX_AGE`.
         self.ages = np.full((n_rows, height, width), MAX_AGE, np.uint8)
 
     def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Forgets everything in the rows `begun` except their frame.
+        """Forgets everything in the rows `begun`, then stores their frames.
 
         `frames` has a frame for every row.
         """
@@ -45,7 +45,8 @@ class LastSeen:
     def fading(self, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Returns the strength of each observed value, shape (n, H, W, n_observations).
 
-        255 in cells observed in the last frame, half of it after every `HALF_LIFE` steps.
+        The strength is 255 in cells that the last frame observed, and halves every `HALF_LIFE`
+        steps.
         """
         is_value = self._values[rows][..., np.newaxis] == self._known
         return is_value * _STRENGTHS[self.ages[rows]][..., np.newaxis]

@@ -34,7 +34,8 @@ class WildfireMovesEnv(WorldEnv):
     `Discrete(4)`: 0 up, 1 down, 2 left, 3 right. A move off the grid or into a no-fly cell leaves
     the robot in place. The action mask, `(4,)` int8, is 1 for each move that leads to another cell.
     If no move does, it is 1 for all moves. The mask is in `info["action_mask"]`, and can be an
-    observation part. `action_masks()`, which MaskablePPO of sb3-contrib calls, returns it, too.
+    observation part. It is also returned by `action_masks()`, which MaskablePPO of sb3-contrib
+    calls.
 
         action = env.action_space.sample(info["action_mask"])
 
@@ -51,7 +52,7 @@ class WildfireMovesEnv(WorldEnv):
     | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | the last observations around the robot |
     | `action_mask` | `Box(0, 1, (4,), int8)` | 1 for each move that leads to another cell |
 
-    `local` has five channels, each times 255:
+    `local` has five channels, whose values are multiplied by 255:
 
     1. The probability of the state that pays most.
     2. The entropy of the belief divided by log S. Channels 1 and 2 are 0 in the cells that this
@@ -69,16 +70,16 @@ class WildfireMovesEnv(WorldEnv):
 
     With `reward="share"` (the default), `"team"` or `"marginal"`, the last move of a path gets the
     path's reward, and all other moves get 0. Cells pay by their state after the world has moved, so
-    the reward is known only after the flight. The three differ only in worlds of several robots, as
-    in `WildfireEnv`.
+    the reward is known only after the last move. These three rewards differ only in worlds of
+    several robots, as in `WildfireEnv`.
 
     With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
     the world moves. (If the model pays for seen cells, a cell pays when it is first seen.) The last
-    move's reward also corrects the sum to the robot's share of the path's true reward, so `"move"`
-    and `"share"` have the same sum over each path. The correction is small for a lone robot, as one
-    step changes few cells. But `"move"` reveals more about the hidden state, and earlier, so
-    results with the two are not comparable. It needs the hidden states: with `instance`, the server
-    must publish them.
+    move's reward also includes a correction, so that the rewards of a path sum to the robot's share
+    of the path's true reward, as with `"share"`. The correction is small for a lone robot, as one
+    step changes few cells. But `"move"` reveals more about the hidden state than `"share"` does,
+    and earlier, so results with the two rewards are not comparable. `"move"` needs the hidden
+    states: with `instance`, the server must publish them.
 
     ## Episode End
 
@@ -88,7 +89,7 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Starting State, Information
 
-    As in `WildfireEnv`. The info is about the last complete path, except `action_mask`.
+    As in `WildfireEnv`. Except for `action_mask`, the info is about the last complete path.
 
     ## Arguments
 

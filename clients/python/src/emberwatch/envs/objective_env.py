@@ -17,32 +17,34 @@ from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
 
 
 class WildfireObjectiveEnv(PlansOwner, WorldEnv):
-    """The paper's high-level decision: the objective of the robot's next path.
+    """The paper's high-level decision: an action chooses the objective of the robot's next path.
 
     ## Description
 
-    The world is the one of `WildfireEnv`. The environment keeps a belief about it, plans a path for
-    each of eight objectives, and describes each planned path by features. The learner, in the role
-    of the paper's deep Q-network (section III.E), chooses which path is flown.
+    The world is the same as in `WildfireEnv`. The environment keeps a belief about the world, plans
+    a path for each of eight objectives, and describes each planned path by features. The learner,
+    in the role of the paper's deep Q-network (section III.E), chooses which path is flown.
 
     ## Action Space
 
     `Discrete(8)`, one action for each of the `objectives`: the probability of the state that pays
-    most; the same plus the entropy of the belief, with two different weights; the entropy alone;
-    cells that have long been unobserved; the probability along three paths together; the region of
-    the highest probability; the region that has been unobserved for longest.
+    most; the same plus the entropy of the belief, with two different weights (two actions); the
+    entropy alone; cells that have long been unobserved; the probability along three paths together;
+    the region of the highest probability; the region that has been unobserved for longest.
 
     ## Observation Space
 
     `Box(-inf, inf, (8, 26), float32)`: row i describes the path that action i flies.
     `feature_names` names the 26 features, and docs/environments/objective.md explains them. One
-    network can score each row separately. `gymnasium.wrappers.FlattenObservation` makes a vector.
+    network can score each row separately. `gymnasium.wrappers.FlattenObservation` flattens the rows
+    to one vector.
 
     ## Starting State
 
     As in `WildfireEnv`. The first belief is the one that `prior` names, or the learned one. With
     ``reset(options={"resume": True})``, it is the belief that the last agent left for the world's
-    current step. Without one, it is computed from the frames of the episode that the server keeps.
+    current step. If no agent left a belief, it is computed from the frames of this episode that the
+    server keeps.
 
     ## Rewards, Episode End, Information
 
@@ -54,24 +56,28 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     * `estimator`: the kind of belief. The default is the kind that `checkpoint` contains, or
       `"known_model"` without a checkpoint. If fires are rare, learned estimators find several times
-      as many.
+      as many burning cells as estimators with a known model.
         * `"known_model"`: the Bayes filter with the true model
-        * `"spatial_filter"`: known, where observations also correct neighbouring cells
-        * `"second_order_filter"`: known, with a second-order mean of the ratio in eq. 3
-        * `"cavity_filter"`: known, predicting a cell without its own influence on its neighbours
-        * `"spatial_cavity_filter"`: known+spatial, predicting like known+cavities
+        * `"spatial_filter"`: as `"known_model"`, but observations also correct neighbouring cells
+        * `"second_order_filter"`: as `"known_model"`, but with a second-order approximation of the
+          mean of the ratio in eq. 3
+        * `"cavity_filter"`: as `"known_model"`, but predicts a cell without its own influence on
+          its neighbours
+        * `"spatial_cavity_filter"`: as `"spatial_filter"`, but predicts like `"cavity_filter"`
         * `"learned_filter"`: a Bayes filter with learned parameters
-        * `"learned_spatial_filter"`: learned, where observations also correct neighbouring cells
-        * `"learned_cavity_filter"`: learned, predicting like known+cavities
-        * `"learned_spatial_cavity_filter"`: learned+spatial, predicting like known+cavities
-        * `"neural_belief"`: a learned network that predicts observations from the last ones
+        * `"learned_spatial_filter"`: as `"learned_filter"`, but observations also correct
+          neighbouring cells
+        * `"learned_cavity_filter"`: as `"learned_filter"`, but predicts like `"cavity_filter"`
+        * `"learned_spatial_cavity_filter"`: as `"learned_spatial_filter"`, but predicts like
+          `"cavity_filter"`
+        * `"neural_belief"`: a learned network that predicts observations from the last observations
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
-    * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; it
-      takes a second the first time), `"initial"` or `"uniform"`.
+    * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; its
+      first computation takes about a second), `"initial"` or `"uniform"`.
 
-    With `instance`, this process keeps the beliefs and plans, too. It publishes its beliefs as
-    `emberwatch-agent` does, and `close` leaves them to the next client. If the server hides its
-    model, pass `model` or `checkpoint`.
+    With `instance`, too, this process computes the beliefs and plans. It publishes its beliefs as
+    `emberwatch-agent` does, and `close` leaves them to the next client of the worlds. If the server
+    hides its model, pass `model` or `checkpoint`.
 
     ## Vectorized environment
 
@@ -145,7 +151,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
 
 class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
-    """Many worlds of `WildfireObjectiveEnv`, stepped and planned for together.
+    """Many worlds of `WildfireObjectiveEnv`, with their steps and plans computed together.
 
     Takes the arguments of `WildfireObjectiveEnv`, and `num_envs`, `max_episode_steps` and
     `autoreset_mode` of `WildfireVectorEnv`.

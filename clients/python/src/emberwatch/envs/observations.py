@@ -20,14 +20,14 @@ from emberwatch.errors import InvalidArgumentError, invalid
 Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
 MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move", "action_mask"]
 
-#: One part makes a plain observation, several make a flat dictionary.
+#: A single part is a plain observation, several parts are a flat dictionary.
 Parts: TypeAlias = Part | Sequence[Part]
 MovesParts: TypeAlias = MovesPart | Sequence[MovesPart]
 
 #: Default side of the parts `local` and `recent`, in cells.
 WINDOW: Final = 15
 
-#: Maximum side of these parts.
+#: Maximum side of the parts `local` and `recent`, in cells.
 MAX_WINDOW: Final = 255
 
 #: Parts that need a filter, parts that need a memory of frames, and parts about other robots.
@@ -51,8 +51,8 @@ class Observations:
     ) -> None:
         """Checks the parts and makes their spaces.
 
-        With `flights`, the parts about an incomplete path are available. `first`: index of the
-        first row's robot in its world.
+        With `flights`, the parts about an incomplete path are available. `first` is the index of
+        the first row's robot in its world.
         """
         known = _spaces(spec, None if flights is None else window)
         names = names_of(parts)
@@ -86,7 +86,7 @@ class Observations:
         #: Whether the last frame alone determines the observation.
         self._has_no_memory = not (OF_BELIEF | _OF_MEMORY) & set(names)
         self._beliefs = np.empty(0, np.uint8)
-        # One row for each observed value; the last row is for unobserved cells.
+        # One row for each observed value, and a last row for unobserved cells.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
 
     def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
@@ -128,8 +128,8 @@ class Observations:
         Args:
             frames: The frames of all rows; not copied.
             robots: Row and column of each robot; not copied.
-            teams: Team frames and results of all robots of the worlds; needed if the rows are not
-                all robots of their worlds.
+            teams: The team frames, and the results of all robots of the worlds. Needed if the rows
+                do not include all robots of their worlds.
         """
         parts = {name: self._part(name, frames, robots, teams) for name in self._names}
         return parts[self._names[0]] if self._is_plain else parts
@@ -183,7 +183,7 @@ class Observations:
         return self._flights.n_made
 
     def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Returns 255 in the cells of each row's teammates; `robots` has all robots."""
+        """Returns 255 in the cells of each row's teammates; `robots` includes all robots."""
         spec = self._spec
         shown = np.zeros((self._n_rows, spec.height, spec.width, 1), np.uint8)
         own = np.remainder(self._first + np.arange(self._n_rows), spec.n_robots)
@@ -200,7 +200,7 @@ class Observations:
         return Filters(spec.model, prior_of(None, spec.model, **grid), self._n_rows)
 
     def _show(self, rows: NDArray[np.bool_]) -> None:
-        """Computes the beliefs and windows of `rows`, which begin a new path."""
+        """Updates the beliefs and windows of `rows`, in which a new path begins."""
         if self._filters is not None and "belief" in self._names:
             beliefs = np.rint(255.0 * self._filters.predictor.transpose(1, 2, 3, 0))
             self._beliefs = beliefs.astype(np.uint8)
@@ -222,7 +222,7 @@ def cells_of(robots: NDArray[np.void]) -> NDArray[np.int64]:
 
 
 def names_of(parts: object) -> tuple[str, ...]:
-    """Returns the names in the argument `observation`, unchecked."""
+    """Returns the names in the argument `observation`, without checking them."""
     if isinstance(parts, str):
         return (parts,)
     return tuple(map(str, cast("Iterable[object]", parts))) if isinstance(parts, Iterable) else ()

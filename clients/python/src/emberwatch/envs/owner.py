@@ -14,14 +14,14 @@ from emberwatch.model import Model
 
 
 class SessionOwner:
-    """The public attributes of an environment or vector environment, read from its session."""
+    """The public attributes of an environment or vector environment, taken from its session."""
 
     _session: Session
     _made_by: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification that `gymnasium.make` used, with keywords that JSON can represent."""
+        """The specification that `gymnasium.make` used, with values that JSON can represent."""
         return self._made_by
 
     @spec.setter
@@ -42,7 +42,7 @@ class SessionOwner:
 
     @property
     def n_moves(self) -> int:
-        """Moves of a path, T."""
+        """Number of moves in a path, T."""
         return self._session.spec.n_moves
 
     @property
@@ -61,7 +61,7 @@ class SessionOwner:
 
     @property
     def lease(self) -> Lease:
-        """The lease on the environment's robots, after a reset: for snapshots and forks of worlds.
+        """The lease on the environment's robots, after a reset, for snapshots and forks of worlds.
 
         After `lease.restore` or `lease.fork`, continue with ``reset(options={"resume": True})``.
         """
@@ -74,7 +74,7 @@ class SessionOwner:
 
     @property
     def turn(self) -> AbstractContextManager[object]:
-        """A lock for `with` statements, which lets one thread at a time step or reset."""
+        """A lock, for `with` statements, that lets only one thread at a time step or reset."""
         return self._session.turn
 
     def allow_test_worlds(self) -> None:
@@ -89,7 +89,7 @@ class SessionOwner:
 def state_of(environment: object, is_open: bool, maker: str) -> dict[str, Any]:
     """Returns the state of a closed environment for a copy or a pickle.
 
-    `maker`: the call that makes another environment, for the error.
+    `maker` is the call that makes another environment, for the error message.
     """
     if is_open:
         raise TypeError(

@@ -34,9 +34,10 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     Actions, observations and rewards of each agent are the same as in `WildfireMovesEnv` with
     `action="move"`, and as in `WildfireEnv` with `action="path"`. The robots begin, step and end
-    their episodes together. Seeds, `resume`, infos and pictures work as in these environments; a
-    picture shows the whole team. The action mask of each agent is in `infos[agent]["action_mask"]`,
-    or in the observation if `observation` names it. PettingZoo's tools read both.
+    their episodes together. Seeds, `resume`, infos and pictures work as in `WildfireMovesEnv` and
+    `WildfireEnv`, except that a picture shows the whole team. The action mask of each agent is in
+    `infos[agent]["action_mask"]`, or in the observation if `observation` names it. PettingZoo's
+    tools read both.
 
     Takes the arguments of these environments, all by keyword, and:
 
@@ -156,14 +157,15 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     def action_masks(self) -> dict[str, NDArray[np.int8]]:
         """Returns the mask of each agent, as in its info; see `WildfireMovesEnv.action_masks`.
 
-        Only with `action="move"`: in a path, where a move leads depends on the moves before it.
+        Available only with `action="move"`, because in a path, where a move leads depends on the
+        moves before it.
         """
         if not isinstance(self._worlds, WildfireMovesVectorEnv):
             raise invalid("action_masks", "an environment with action='move'", "'path'")
         return dict(zip(self.possible_agents, self._worlds.action_masks(), strict=True))
 
     def state(self) -> NDArray[np.uint8]:
-        """Returns the team's last frame and the robots' cells, not the hidden states.
+        """Returns the team's last frame and the robots' cells, without the hidden states.
 
         The channels are 0 or 255: one for each observed value, one for unobserved cells, and one
         for the robots' cells. Shape (H, W, O + 2).
@@ -199,7 +201,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     def _infos(self, infos: dict[str, Any]) -> dict[str, dict[str, Any]]:
         if self._observes_masks:
-            # PettingZoo allows a mask in the observation or in the info; TorchRL fails if both
+            # PettingZoo allows a mask in the observation or in the info, but TorchRL fails if both
             # have one.
             infos = {name: each for name, each in infos.items() if name != "action_mask"}
         return {agent: info_of(infos, row) for row, agent in enumerate(self.possible_agents)}

@@ -65,36 +65,36 @@ class WildfireEnv(WorldEnv):
 
     ## Rewards
 
-    The number of distinct visited cells that burn after the world has moved. In general, the sum of
-    the model's rewards over the distinct visited cells, or over the seen cells if the model pays
-    for them. The start cell counts only if the path returns to it. In a world of several robots,
-    `reward` chooses between `"share"` (the default: a cell that v robots visited pays each of them
-    1 / v), `"team"` (the reward of all robots together), and `"marginal"` (how much lower the
-    team's reward would be without this robot).
+    In the wildfire model, the number of distinct visited cells that burn after the world has moved.
+    In general, the sum of the model's rewards over the distinct visited cells, or over the distinct
+    seen cells if the model pays for those. The start cell counts only if the path returns to it. In
+    a world of several robots, `reward` chooses between `"share"` (the default: a cell that v robots
+    visited pays each of them 1 / v), `"team"` (the reward of all robots together), and `"marginal"`
+    (how much lower the team's reward would be without this robot).
 
     ## One Robot of a Team
 
     With `instance` and for example `robot=2`, the environment flies one robot of a world, and other
-    processes fly the others. A step waits for the paths of all robots that a client holds, but no
-    longer than the server's `--deadline-ms`. A path that comes too late is not flown: the step
-    returns the world's current results, and `info["n_missed"]` is the number of steps in which
+    processes fly the other robots. A step waits for the paths of all robots that a client holds,
+    but no longer than the server's `--deadline-ms`. A path that comes too late is not flown: the
+    step returns the world's current results, and `info["n_missed"]` is the number of steps in which
     this robot stayed where it was. `reset` begins no episode, because other clients share the
-    world. It joins the current episode, and uses its `seed` only for `np_random`. To fly all robots
-    of a world, use `emberwatch.parallel_env`.
+    world. It joins the current episode, and uses the argument `seed` only for `np_random`. To fly
+    all robots of a world, use `emberwatch.parallel_env`.
 
     ## Starting State
 
-    The world after `burn_in` steps from the model's initial distribution. It is a pure function of
-    the seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
-    reset without a seed draws one from `np_random`. The robot is at `start`, and no cell has been
-    observed. `reset(options={"resume": True})` begins no episode. It continues the current one, for
-    example after another agent, or after an interrupted step.
+    The world after `burn_in` steps from the model's initial distribution. This state is a pure
+    function of the seed: `reset(seed=s)` begins the same episode here, in the vector environment
+    and in Rust. A reset without a seed draws one from `np_random`. The robot is at `start`, and no
+    cell has been observed. `reset(options={"resume": True})` begins no episode. It continues the
+    current episode, for example after another agent, or after an interrupted step.
 
     ## Episode End
 
     Never `terminated`. `truncated` after `max_episode_steps` (default 1,000; pass another number to
-    `gymnasium.make`), or after the number of steps that the task or the running server's
-    `--max-steps` sets.
+    `gymnasium.make`), or after the number of steps set by the task or by the running server's
+    `--max-steps`.
 
     ## Information
 
@@ -105,16 +105,16 @@ class WildfireEnv(WorldEnv):
 
     ## Arguments
 
-    All by keyword, through `gymnasium.make("emberwatch/Wildfire-v0", ...)`. Defaults are in
+    All arguments are keywords of `gymnasium.make("emberwatch/Wildfire-v0", ...)`. Defaults are in
     parentheses.
 
     * `observation`: the parts of the observation (`("frame", "robot")`).
     * `reward`: `"share"`, `"team"` or `"marginal"` (`"share"`).
     * `instance`: the running server to attach to. None: simulate the world in this process. The
-      results are the same bytes either way.
+      results are byte for byte the same either way.
     * `world`: with `instance`, the number of the server's world (0).
     * `robot`: with `instance`, the index of the robot in its world, if other clients fly the rest
-      (None: the world has only one robot).
+      (None: the world has only this robot).
     * `takeover`: with `instance`, whether to take the world from its holder (False).
     * `task`: the name of a built-in task, such as `"small"`, or the path of a task file
       (`docs/environments/index.md` lists tasks and models). A task determines `robots`, all
@@ -125,8 +125,8 @@ class WildfireEnv(WorldEnv):
       (None: the model's), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): for worlds
       in this process. With `instance`, leave them out or repeat the server's values.
     * `states`: recorded states instead of a model: the name of built-in states, a `.npz` or `.npy`
-      file, or a folder (see `docs/recorded-worlds.md`). They determine `height`, `width` and
-      `burn_in`, and the last recorded step truncates the episode.
+      file, or a folder (see `docs/recorded-worlds.md`). Recorded states determine `height`, `width`
+      and `burn_in`, and an episode is truncated at their last step.
     * `states_symmetries` (False), `states_offset` (0): how episodes are made of recorded states.
     * `truth`: whether to reveal the hidden states in `info` and pictures (False).
     * `timeout`: seconds to wait for a step of a running server, and for the server to start (5).
@@ -217,17 +217,18 @@ class WildfireEnv(WorldEnv):
 class WildfireVectorEnv(WorldVectorEnv):
     """Many robots of `WildfireEnv`, stepped together: all robots of one or more worlds.
 
-    Observations, rewards, episode ends and infos are the same, field by field, as from Gymnasium's
-    `SyncVectorEnv` of single environments with the same seeds, in all three autoreset modes. World
+    In all three autoreset modes, observations, rewards, episode ends and infos are the same, field
+    by field, as from Gymnasium's `SyncVectorEnv` with single environments and the same seeds. World
     i of `reset(seed=s)` has seed s + i. `options={"reset_mask": mask}` resets only some worlds.
 
     Takes the arguments of `WildfireEnv`, and:
 
     * `num_envs`: number of robots, a multiple of `robots`. None: the robots of one world.
-    * `robots`: number of robots of each world (1). They begin and end their episodes together.
+    * `robots`: number of robots of each world (1). The robots of a world begin and end their
+      episodes together.
     * `max_episode_steps`: number of steps after which episodes are truncated; None or -1: never.
     * `autoreset_mode`: a `gymnasium.vector.AutoresetMode`; `NEXT_STEP` by default.
-    * `world`: the number of the first world; the others follow it.
+    * `world`: with `instance`, the number of the first world; the other worlds follow it.
     * `render_mode`: `"human"` shows only the first world.
     """
 

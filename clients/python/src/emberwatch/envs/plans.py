@@ -72,7 +72,8 @@ class Plans:
         #: Name of the estimator that computes the beliefs.
         self.estimator: Final = self._made().estimator
         self._native: _native.Options | None = None
-        #: Instance and number of world 0 for published beliefs; None: beliefs are not published.
+        #: The instance in which beliefs are published, and its number for world 0; None: they are
+        #: not published.
         self._watched: tuple[str, int] | None = None
         #: Features of all worlds' plans; a new array after each step.
         self.features = np.zeros((session.n_worlds, *shape), np.float32)
@@ -83,9 +84,9 @@ class Plans:
     ) -> None:
         """Begins or resumes the episodes of the worlds in `begun`.
 
-        A resumed world's belief is the one that an agent left for the current step. Without one, it
-        is computed from the frames that the server keeps. `results` and `frames` have a row for
-        every world.
+        A resumed world's belief is the one that an agent left for the current step. If no agent
+        left one, the belief is computed from the frames that the server keeps. `results` and
+        `frames` have a row for every world.
         """
         settings = self._session.settings
         watched = None if settings.instance is None else (settings.instance, settings.world)
@@ -114,9 +115,9 @@ class Plans:
         results: NDArray[np.void],
         frames: NDArray[np.uint8],
     ) -> None:
-        """Updates the beliefs of the worlds in `moved` with a step, and plans again in them.
+        """Updates the beliefs about the worlds in `moved` with a step, and plans again there.
 
-        Arrays have a row for every world; `choices` are the flown options.
+        All arrays have a row for every world; `choices` are the options that were flown.
         """
         self._plan(moved, results, frames, choices)
 
@@ -131,7 +132,7 @@ class Plans:
         return self.features
 
     def close(self, results: NDArray[np.void] | None) -> None:
-        """Leaves the beliefs to the next client of a running server's worlds."""
+        """Leaves the beliefs about a running server's worlds to their next client."""
         native, self._native = self._native, None
         if native is None:
             return
@@ -152,7 +153,7 @@ class Plans:
                 if left is not None:
                     lease.leave_belief(StepResult(*at), *left, robot=lease.robots[world])
             except EmberwatchError:
-                return  # the server ended or keeps no beliefs: the next client recalls frames
+                return  # the server ended or keeps no beliefs: the next client uses past frames
 
     def _plan(
         self,

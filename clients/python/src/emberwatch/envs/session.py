@@ -1,7 +1,7 @@
-"""Sessions: the robots behind an environment, in worlds of this process or of a running server.
+"""Sessions: the robots that an environment flies, in this process or on a running server.
 
-A session opens nothing before the first reset. So an environment can be made in one process and
-used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
+A session opens no worlds before the first reset, so that an environment can be made in one process
+and used in a forked child, as in Gymnasium's `AsyncVectorEnv`.
 """
 
 import inspect
@@ -37,11 +37,11 @@ from emberwatch.errors import (
 )
 from emberwatch.model.tasks import Task
 
-# Seconds without use after which a lease on a running server expires. Long, as learners may pause
-# between steps. The server notices a dead holder at once anyway.
+# Seconds without use after which a lease on a running server expires. It is long because learners
+# may pause between steps. The server notices a dead client at once anyway.
 _LEASE: Final = 3600.0
 
-#: Errors after which the session does not hold its worlds, or does not know their step.
+#: Errors after which the session no longer holds its worlds, or does not know their step.
 LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 
@@ -67,11 +67,14 @@ class State(Enum):
     CLOSED = "closed"
     #: The worlds are in the state that the last step or reset returned.
     READY = "ready"
-    #: A step or reset has begun, and has not changed anything yet: a refusal leads back to READY.
+    #: A step or reset has begun, but has changed nothing yet. If it is refused, the state is READY
+    #: again.
     BEGUN = "begun"
-    #: A step or reset has changed worlds, and the environment has not finished processing it.
+    #: A step or reset has changed worlds, but the environment has not finished processing the
+    #: result.
     MOVED = "moved"
-    #: A reset follows an interrupted call: the server may still work on the interrupted request.
+    #: A reset has begun after an interrupted call, whose request the server may still be
+    #: processing.
     TORN = "torn"
     #: A request was not answered in time.
     TIMED_OUT = "timed out"
@@ -79,7 +82,7 @@ class State(Enum):
     OVER = "over"
 
 
-#: States in which worlds may have moved without the session's knowledge: steps are refused.
+#: States in which steps are refused, because worlds may have moved without the session's knowledge.
 _UNFINISHED: Final = frozenset((State.BEGUN, State.MOVED, State.TORN, State.TIMED_OUT))
 
 
@@ -87,9 +90,10 @@ class Session:
     """Consecutive robots under a lease, one row for each. The first reset opens the session.
 
     A session flies all robots of its worlds, or one robot of a world that other clients fly in. An
-    environment holds `turn` during each step and reset, as threads may share the environment. It
-    calls `begin_step` or `begin_reset` first and `finish` last. Ctrl-C or a signal handler may
-    interrupt anything in between. Then the state stays unfinished, and steps are refused.
+    environment holds the lock `turn` during each step and reset, as threads may share the
+    environment. It first calls `begin_step` or `begin_reset`, and at the end `finish`. Ctrl-C or a
+    signal handler may interrupt it in between. Then the state stays unfinished, and steps are
+    refused.
     """
 
     def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
@@ -104,7 +108,7 @@ class Session:
         self._made_after, self._turn = _n_forks, threading.RLock()
         #: Whether test worlds are allowed without a warning, as in an evaluation.
         self.allows_test_worlds = False
-        # Worlds can move without this session's path only if other clients fly in them.
+        # Only worlds in which other clients fly can move without this session's path.
         self._accepts_late = settings.robot is not None
         #: Number of world steps that the last answer skipped, because a path came too late.
         self.n_skipped = 0
@@ -130,11 +134,11 @@ class Session:
 
     @property
     def turn(self) -> threading.RLock:
-        """A lock for `with` statements, which lets one thread at a time step or reset."""
+        """A lock, for `with` statements, that lets only one thread at a time step or reset."""
         if self._made_after != _n_forks:
             with _fork_lock:
                 if self._made_after != _n_forks:
-                    # The thread that held it may not exist in a forked child.
+                    # The lock's holder may be a thread that does not exist in a forked child.
                     self._turn, self._made_after = threading.RLock(), _n_forks
         return self._turn
 
@@ -157,11 +161,11 @@ class Session:
 
     @property
     def is_unfinished(self) -> bool:
-        """Whether worlds may have moved unobserved: then all of them must be reset or resumed."""
+        """Whether worlds may have moved unobserved, so that all must be reset or resumed."""
         return self._state in _UNFINISHED
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leaves out the lock, so that a copy does not wait for threads of this session."""
+        """Omits the lock, so that a copy does not wait for threads of this session."""
         return {name: value for name, value in vars(self).items() if name != "_turn"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -184,7 +188,7 @@ class Session:
     def refuse_over(self) -> EmberwatchError:
         """Returns the error for a shared world whose episode is over.
 
-        Steps raise it until the next reset.
+        Steps raise this error until the next reset.
         """
         self._state = State.OVER
         return self._no_step()
@@ -202,7 +206,7 @@ class Session:
         """Begins new episodes in the worlds `indices`; returns the results of all worlds.
 
         `indices` count the session's worlds from 0. If the server has ended, a reset of all worlds
-        connects to its successor.
+        connects to a new server of the same instance.
         """
         may_move = self.is_open and len(indices) == self.n_worlds
         try:
@@ -213,10 +217,11 @@ class Session:
         return self._begin(indices, seeds)
 
     def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
-        """Flies paths with all robots, or with the consecutive robots `rows` of some worlds.
+        """Flies a path with each robot, or with each of the consecutive robots `rows`.
 
-        Waits for slow teammates as long as the server lives. If the world moved on without this
-        path, the path is dropped, and the answer has the world's current results.
+        `rows` includes all robots of some worlds. Waits for slow teammates as long as the server
+        runs. If a shared world moved on without this path, the path is dropped, and the answer has
+        the world's current results.
         """
         lease = self._opened()
         first, n_robots = self._first, self.n_rows
@@ -245,7 +250,7 @@ class Session:
 
     def teams(self, answer: StepAnswer) -> StepAnswer:
         """Returns the results of all robots in the answer's world, and the team's frame."""
-        # Recalls the step of the answer, as other clients may have moved the world since.
+        # Recalls the answer's step, because other clients may have moved the world since then.
         shape, client = self.spec.shape, self._client
         if client is None:
             raise not_reset()
@@ -281,7 +286,7 @@ class Session:
     def close(self) -> None:
         """Releases the worlds; the next reset opens the session again.
 
-        May be called again, also after an interrupted call.
+        May be called several times, also after an interrupted call.
         """
         self._state = State.CLOSED
         lease, self._lease = self._lease, None
@@ -298,7 +303,7 @@ class Session:
             self._truth = self._client = None
 
     def _open(self, seed: int) -> None:
-        """Opens and acquires the worlds, or waits until the server ends an interrupted call.
+        """Opens the worlds, or waits until the server has finished an interrupted call.
 
         `seed` is the seed of world 0, for worlds in this process.
         """
@@ -338,11 +343,12 @@ class Session:
         """Waits until the server has finished an interrupted step or reset."""
         client = self._client
         assert client is not None
-        # Checks first that the server answers, as the next request may wait for a burn-in.
+        # Checks first that the server answers, because the answer to `acquire` may take a whole
+        # burn-in.
         client.status(timeout=self.settings.timeout)
         try:
-            # The answer comes after the burn-in of a reset. The server then refuses paths under
-            # the old lease.
+            # The answer comes only after a reset's burn-in. From then on, the server refuses paths
+            # sent with the old lease.
             self._lease = self._acquire(client, takeover=False)
         except EmberwatchError as error:
             if error.code == "busy":
@@ -388,14 +394,14 @@ class Session:
             return
         try:
             self._warn_of_task(task)
-        except Warning:  # a filter turns warnings into errors: nothing has changed yet
+        except Warning:  # a warnings filter raised it as an error: nothing has changed yet
             if self._state is State.BEGUN:
                 self._state = State.READY if self.is_open else State.CLOSED
             raise
 
     def _warn_of_task(self, task: Task) -> None:
         tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
-        # Attributed to this line, not to the caller, so that Python shows it once per process.
+        # Attributed to this line instead of the caller's, so that Python shows it once per process.
         warnings.warn(
             f"task {task.name!r}: an episode begins on a test world (seeds {tests.start} to "
             f"{tests.stop - 1}); train on seeds from {others} on, with reset(seed={others}) or a "
@@ -406,7 +412,10 @@ class Session:
         )
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
-        """Closes the session after a loss, so that a reset opens it again; remembers a timeout."""
+        """Closes the session after a loss, so that a reset opens it again.
+
+        After a timeout, the session stays open, and only its state changes.
+        """
         if isinstance(error, RequestTimeoutError):
             self._state = State.TIMED_OUT
         else:
@@ -420,7 +429,7 @@ class Session:
 
     @contextmanager
     def _classified(self) -> Generator[None]:
-        """Updates the state from the errors of a reset or resume."""
+        """Updates the state if a reset or resume raises an error."""
         try:
             yield
         except LOST as error:

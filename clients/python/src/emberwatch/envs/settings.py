@@ -21,10 +21,11 @@ from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace, Zones
 from emberwatch.model.tasks import Task, built_in_tasks
 
-#: Upper bound of drawn seeds, which every JSON reader represents exactly (PROTOCOL.md section 2).
+#: Drawn seeds are below this number, so that every JSON reader represents them exactly (PROTOCOL.md
+#: section 2).
 SEEDS: Final = 2**53
 
-#: Maps settings of `config/server.toml` to keywords whose names differ.
+#: Maps names of settings, as in error messages, to the keywords whose names differ.
 _KEYWORDS: Final = {
     "moves": "n_moves",
     "worlds": "num_envs",
@@ -32,7 +33,7 @@ _KEYWORDS: Final = {
     "cells times robots": "height times width times robots",
 }
 
-#: Hints for removed keywords.
+#: Hints about keywords that were removed.
 _REMOVED: Final = {
     "backend": " (removed: worlds are simulated in this process; instance=... attaches to a server)"
 }
@@ -41,7 +42,7 @@ _Init = TypeVar("_Init")
 
 
 class WorldArguments(TypedDict, total=False):
-    """The keywords for type checkers; `Settings` has the defaults."""
+    """The types of the keywords, for type checkers; `Settings` has the defaults."""
 
     instance: str | None
     world: int
@@ -66,7 +67,7 @@ class WorldArguments(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """The keywords, which `WildfireEnv` explains. None: the default, or the server's value."""
+    """The keywords that `WildfireEnv` explains. None means the default, or the server's value."""
 
     instance: str | None = None
     world: int = 0
@@ -87,8 +88,8 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
-    #: Whether infos and pictures show the hidden states. If not, `truth` may still be set, for
-    #: rewards that need them.
+    #: Whether infos and pictures show the hidden states. Even if False, `truth` may be set, for
+    #: rewards that need the hidden states.
     reveals: bool = False
 
     def __post_init__(self) -> None:
@@ -128,7 +129,7 @@ class Settings:
                 alike = get_close_matches(name, known, 1)
                 hint = f" (did you mean {alike[0]!r}?)" if alike else ""
                 hint = _REMOVED.get(name, hint)
-                # Python's own message, which TorchRL parses to drop the keyword.
+                # This is Python's own message, which TorchRL parses to find a keyword to leave out.
                 raise TypeError(
                     f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
                     f"known keywords: {', '.join(sorted(known))}"
@@ -137,7 +138,7 @@ class Settings:
         return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
 
     def of_server(self, n_worlds: int) -> dict[str, Any]:
-        """Returns the settings of `n_worlds` worlds, by their names in `config/server.toml`."""
+        """Returns the settings for `n_worlds` worlds, by their names in `config/server.toml`."""
         given = {
             "worlds": n_worlds,
             "robots": self.robots,
@@ -151,14 +152,15 @@ class Settings:
             "sensor_radius": self.sensor_radius,
             "start": self.start,
             "publish_truth": self.truth,
-            # Left out at the default, as they are refused without a states file.
+            # Default values are left out, because a server refuses these settings without recorded
+            # states.
             "states_symmetries": self.states_symmetries or None,
             "states_offset": self.states_offset or None,
         }
         return {name: as_setting(name, it) for name, it in given.items() if it is not None}
 
     def check(self, n_worlds: int) -> dict[str, Any]:
-        """Checks the settings, and returns them with all defaults. Errors name the keyword."""
+        """Checks the settings, and returns them with all defaults. Errors name keywords."""
         try:
             return check_settings(self.of_server(n_worlds))
         except InvalidArgumentError as error:
@@ -189,13 +191,13 @@ def shows_keywords(init: _Init) -> _Init:
 class WorldSpec:
     """The properties of an environment's worlds that are known before the worlds exist."""
 
-    #: None if a running server hides it, or the worlds are recorded.
+    #: The model; None if a running server hides it, or the worlds are recorded.
     model: Model | None
     #: Rows of the grid.
     height: int
     #: Columns of the grid.
     width: int
-    #: Moves of a path, T.
+    #: Number of moves in a path, T.
     n_moves: int
     #: Number of observed values, O.
     n_observations: int
@@ -205,9 +207,9 @@ class WorldSpec:
     airspace: Airspace
     #: Zones of land, for pictures; None if there are no zones, or a running server hides them.
     zones: Zones | None
-    #: Robots of each world.
+    #: Number of robots in each world.
     n_robots: int
-    #: Whether the hidden states come from a states file instead of a model.
+    #: Whether the hidden states come from recorded states instead of a model.
     is_recorded: bool
     #: The description of recorded states; None if worlds are simulated, or the server hides it.
     description: Description | None = None
@@ -216,7 +218,7 @@ class WorldSpec:
 
     @property
     def described(self) -> Description | None:
-        """The description or model, for the names and rewards of states; None if hidden."""
+        """The model or description, for names and rewards of states; None if it is hidden."""
         return self.description or self.model
 
     @property
@@ -230,9 +232,9 @@ def draw_seed(generator: np.random.Generator) -> int:
 
 
 def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
-    """Returns the spec of the worlds that this process will simulate, and the robots to fly.
+    """Returns the spec of the worlds that this process will simulate, and the robots' numbers.
 
-    `n_rows`: number of robots; None: all robots of one world.
+    `n_rows` is the number of robots; None: all robots of one world.
     """
     shared = ("takeover", False), ("world", 0), ("robot", None)
     for name, default in shared:
@@ -266,7 +268,7 @@ def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
 def running_spec(
     settings: Settings, n_rows: int | None, info: ServerInfo
 ) -> tuple[WorldSpec, range]:
-    """Returns the spec of a running server's worlds, and the robots to fly.
+    """Returns the spec of a running server's worlds, and the numbers of the robots to fly.
 
     Raises:
         InvalidArgumentError: If the settings do not match the server.
@@ -348,7 +350,7 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
 
 
 def _described(checked: dict[str, Any]) -> Description:
-    """Returns the model, or the description of recorded states, of checked settings."""
+    """Returns the model that checked settings name, or the description of their recorded states."""
     if checked["states"]:
         described: Description = _description(local(checked["states"]))
     else:

@@ -53,7 +53,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 ):
     """A vector environment of many robots, stepped together."""
 
-    # True until `__init__` ends, as Gymnasium 1.2 also closes an object whose `__init__` failed.
+    # True until `__init__` ends, because Gymnasium 1.2 also closes an object whose `__init__`
+    # failed.
     closed = True
 
     def __init__(
@@ -66,7 +67,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
     ) -> None:
-        """`pays`: the index in `base.REWARDS` of the reward of a step."""
+        """`pays` is the kind of reward, an index in `base.REWARDS`."""
         if max_episode_steps == -1:  # means no limit in `gymnasium.make`
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
@@ -95,7 +96,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._none = np.zeros(num_envs, np.bool_)
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over, self._has_ended = self._none, False
-        #: Mask of the robots that completed a path in this step; None: no robot did.
+        #: Mask of the robots that completed a path in the current step; None if no robot did.
         self._exchanged: NDArray[np.bool_] | None = None
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
@@ -113,8 +114,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
         Args:
             seed: The seed s of the first world; world i gets s + i. Or a sequence with one seed for
-                each row; a world takes the seed of its first row. None: each world's generator
-                draws its next seed.
+                each row, of which a world uses the seed of its first row. None: each world's own
+                generator draws a seed.
             options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
                 robots of a world; or `resume`, see `WildfireEnv`.
         """
@@ -192,7 +193,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._views[row].draw(frame, robots, paths, truth)
 
     def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Returns the combined frame of some robots of one world, and their cells; new arrays."""
+        """Returns the combined frame and the cells of some robots of one world, as new arrays."""
         return self._frames[rows].min(axis=0), self._robots()[rows]
 
     @property
@@ -224,7 +225,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         raise NotImplementedError
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
-        """Called after episodes in the rows `begun` have begun or have been resumed."""
+        """Is called after episodes in the rows `begun` have begun or have been resumed."""
 
     def _robots(self) -> NDArray[np.int64]:
         """Returns row and column of each robot as a new array."""
@@ -330,7 +331,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         }
 
     def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
-        """Returns the infos of the rows in `mask`, stacked as Gymnasium does; other rows are 0."""
+        """Returns the infos of the rows in `mask`, stacked as in Gymnasium; other rows are 0."""
         infos: dict[str, Any] = {}
         for name, values in self._reported().items():
             if mask is self._every:
@@ -361,12 +362,12 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._observations.all(self._shown(), self._robots())
 
     def _shown(self) -> NDArray[np.uint8]:
-        """Returns the frames for the learner; copies if pictures or `seen` need the originals."""
+        """Returns frames for the learner, copied if pictures or `seen` need the originals."""
         is_own = self.render_mode is None and not self.keeps_frames
         return self._frames if is_own else self._frames.copy()
 
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
-        """Returns the seed of each world. Checks all before any world's generator is replaced."""
+        """Returns the seed of each world, after checking all before a generator is replaced."""
         n_worlds = self._session.n_worlds
         if seed is None:
             return [None] * n_worlds
@@ -411,6 +412,6 @@ def vector_session(settings: Settings, num_envs: int | None) -> Session:
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[range]:
-    """Returns the runs of consecutive true entries."""
+    """Returns the ranges of consecutive true entries."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False]))))
     return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

@@ -14,7 +14,7 @@ from emberwatch.render.scenery import Scenery
 #: The render modes of all environments.
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 
-#: Pictures per second of a film; the maximum in a window.
+#: Pictures per second in a film, and maximum number per second in a window.
 RENDER_FPS: Final = 10
 
 

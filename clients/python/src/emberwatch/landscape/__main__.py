@@ -39,7 +39,7 @@ examples:
 
 `python -m emberwatch.landscape land` makes a model file with zones from elevation and wind.
 """
-#: Flags that apply only to some kinds.
+#: Flags that apply only to some values of `--kind`.
 _ONLY_FOR: Final = {
     "begin": ("arrival",),
     "burning": ("arrival", "mask"),

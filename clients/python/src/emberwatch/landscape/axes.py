@@ -18,13 +18,13 @@ _STANDARD_NAMES: Final = {
     "Y": ("projection_y_coordinate", "latitude", "grid_latitude"),
     "T": ("time",),
 }
-#: Axes by the name of a dimension, if its coordinates do not state the axis.
+#: Names of dimensions that imply an axis, if their coordinates do not state one.
 _NAMES: Final = {
     "X": ("x", "lon", "longitude", "rlon", "easting", "dimx", "west_east"),
     "Y": ("y", "lat", "latitude", "rlat", "northing", "dimy", "south_north"),
     "T": ("time", "t", "dimt", "date", "step", "layer", "band"),
 }
-_EVEN: Final = 0.1  # tolerance of cell positions, as a share of a cell: 32-bit numbers are rounded
+_EVEN: Final = 0.1  # tolerance for positions, as a share of a cell, as 32-bit numbers are rounded
 
 #: Names of dimensions and coordinates that are most likely angles, not metres.
 _ANGLES: Final = {"lat", "latitude", "rlat", "lon", "longitude", "rlon"}
@@ -45,7 +45,7 @@ class Line(NamedTuple):
     """Cells of one size, side by side along an axis."""
 
     low: float
-    """The smallest coordinate of their edges."""
+    """The smallest coordinate of the cells' edges."""
     cell: float
     """The size of a cell; 0 if unknown."""
     is_falling: bool

@@ -12,9 +12,9 @@ from emberwatch.landscape.layers import Layer
 from emberwatch.landscape.lengths import METRES, NAMES, Side, unit_named
 from emberwatch.landscape.terrain import gradient
 
-_HEIGHTS: Final = (-1000.0, 10_000.0)  # range of heights in metres: all land, but not -9999
+_HEIGHTS: Final = (-1000.0, 10_000.0)  # metres: all land, but not the no-data value -9999
 _LIKE: Final = 0.02  # relative tolerance between --cell and the raster's own cell size
-_FEET: Final = (0.3, 0.31)  # range of all kinds of feet, metres
+_FEET: Final = (0.3, 0.31)  # range of the lengths of all kinds of feet, metres
 _TURNED: Final = 5.0  # angle to true north above which a note is made, degrees
 
 

@@ -24,7 +24,7 @@ UNBURNT, BURNING, BURNT = 0, 1, 2
 
 Kind = Literal["arrival", "mask", "burning", "states"]
 
-#: Parts of words that name each state, in search order.
+#: Parts of words that identify each state, in the order of the search.
 _WORDS: Final = (("not_burn", "unburn"), ("burning",), ("burned", "burnt"))
 MOST_STATES: Final = 1 << 31  # maximum size of a sequence, bytes
 
@@ -33,7 +33,7 @@ MOST_STATES: Final = 1 << 31  # maximum size of a sequence, bytes
 class Times:
     """The times at which each cell of one fire begins to burn, and is burnt.
 
-    They are in steps, and infinite if never.
+    Times are in steps, and infinite if the cell never begins to burn or never is burnt.
     """
 
     arrival: NDArray[np.float64]
@@ -54,9 +54,9 @@ class Meaning:
     step: float
     """Duration of a step, seconds."""
     unit: str | None = None
-    """Unit of arrival times, or of the times of layers; None: the file's."""
+    """Unit of arrival times, or of the times of layers; None: the file's unit."""
     begin: float | None = None
-    """The arrival time of step 0, which replaces earlier times. None: the earliest."""
+    """The arrival time of step 0; earlier arrivals are moved to it. None: the earliest arrival."""
     burning: int = 1
     """Number of steps that a cell burns after its arrival."""
     every: int = 1
@@ -84,7 +84,7 @@ def states(fire: Times, shape: tuple[int, int], rule: Rule) -> NDArray[np.uint8]
     burns = np.isfinite(arrival)
     if not burns.any():
         raise invalid(fire.name, "cells that burn", "none")
-    # A larger cell is burnt when the last of its input cells that ever burn is burnt.
+    # A larger cell is burnt once all of its input cells that ever burn are burnt.
     last = resampled(np.where(burns, burnt, -np.inf), shape, rule, latest=True)
     arrival = resampled(arrival, shape, rule)
     burnt = np.where(np.isfinite(arrival), last, np.inf)
@@ -113,7 +113,7 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     layer = _cropped(layer, meaning)
     arrival = np.where(np.isfinite(layer.values), layer.values, np.inf)
     negative = arrival < 0
-    # If every cell has a time, a negative one may mean never.
+    # If every cell has a time, a negative time may mean that the cell never burns.
     if negative.any() and (meaning.begin is None or not np.isinf(arrival).any()):
         raise InvalidArgumentError(
             f"{layer.name}: expected times of at least 0, got {_first(layer, negative)}; if it "
@@ -129,7 +129,8 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
         )
     step = meaning.step / SECONDS[unit]
     begin = float(finite.min()) if meaning.begin is None else meaning.begin
-    # A step shows the fire at its time: a cell that begins to burn later burns in the next step.
+    # A step shows the fire at the step's time, so a cell that begins to burn later first burns in
+    # the next step.
     steps = steps_at(np.maximum(arrival, begin) - begin, step)
     n_steps = int(steps[np.isfinite(steps)].max()) + 1
     date = layer.clock.date(begin * SECONDS[unit])

@@ -1,4 +1,4 @@
-"""Grids on the ground: checks that layers share one, and resampling to the grid of the world."""
+"""Grids on the ground: checks that layers have one grid, and resampling to the world's grid."""
 
 import math
 from dataclasses import dataclass, replace
@@ -230,7 +230,7 @@ def resampled(
             times = times.take(at, axis=axis)
         else:
             reduce = np.max if latest else np.min
-            # In integers, so that rounding does not make touching cells overlap.
+            # Computed in integers, so that rounding does not make touching cells overlap.
             edges = [(i * old // new, -(-(i + 1) * old // new)) for i in range(new)]
             parts = [
                 reduce(times[(slice(None),) * axis + (slice(*edge),)], axis=axis) for edge in edges

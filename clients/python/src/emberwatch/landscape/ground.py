@@ -13,11 +13,11 @@ import numpy as np
 from emberwatch.errors import invalid
 from emberwatch.landscape.libraries import library
 
-#: Length of the measured lines as a share of the radius of the Earth: about 600 m.
+#: Length of the measured lines, as a share of the Earth's radius. They are about 600 m long.
 _SHARE: Final = 1e-4
 _RADIUS: Final = 6.371e6  # radius of the Earth, metres
-#: Maps whose lengths differ by less from the ground, as in UTM zones and State Planes, count as
-#: exact: cells of 30 m stay cells of 30 m.
+#: Maps whose lengths differ from the ground by a smaller share, as in UTM zones and State Planes,
+#: count as exact, so that cells of 30 m stay cells of 30 m.
 _EXACT: Final = 2e-3
 
 

@@ -19,15 +19,15 @@ _READERS: Final = {
     ".npy": numpy_file.read,
     ".npz": numpy_file.read,
 }
-#: Auxiliary files, which GDAL reads together with the raster of the same name.
+#: Endings of auxiliary files, which GDAL reads together with the raster of the same name.
 _AUXILIARY: Final = (".prj", ".tfw", ".xml")
 
 
 def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
     """Returns the files of each sequence.
 
-    Each folder is a sequence, ordered by the numbers in its file names. All files given by name
-    together are one more sequence. `one_file_each` makes each file a separate sequence.
+    Each folder is a sequence, ordered by the numbers in its file names. All files that are given by
+    name form one more sequence. `one_file_each` makes each file a separate sequence.
     """
     found, loose = list[list[Path]](), list[Path]()
     for path in inputs:
@@ -60,7 +60,7 @@ def read(files: Sequence[Path], choice: Choice) -> Generator[Layer]:
 
 
 def _layers(files: Iterable[Path]) -> list[Path]:
-    """Drops hidden and auxiliary files, by their name (`fire.tif.ovr`) or ending."""
+    """Drops hidden files, and auxiliary ones such as `fire.tif.ovr` and `fire.prj`."""
     files = [file for file in files if not file.name.startswith(".")]
     layers = [file for file in files if file.suffix.lower() in _READERS]
     names = tuple(f"{file.stem}." for file in layers)

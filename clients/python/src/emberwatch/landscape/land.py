@@ -37,8 +37,8 @@ examples:
   python -m emberwatch.landscape land --zones fuel.tif --unburnable 7,8 --no-fly towns.tif \\
       --out fuels.toml
 """
-#: Maximum number of cells of a map in the model file, which may have 16 MiB. Larger maps are
-#: written to a `.npy` file.
+#: Maximum number of cells of a map inside the model file, whose maximum size is 16 MiB. Larger maps
+#: are written to a `.npy` file.
 _MOST_INLINE: Final = 1 << 16
 _MOST_NUMBER: Final = 10**15  # maximum number of a zone; doubles represent all integers up to it
 _MOST_WIND: Final = 100.0  # maximum wind speed, m/s: more than any hurricane
@@ -189,7 +189,7 @@ def _check_flags(flags: argparse.Namespace) -> None:
 
 
 def _check_wind(flags: argparse.Namespace) -> None:
-    """Checks the wind's flags, and sets `wind_towards` from either of them."""
+    """Checks the wind's flags, and sets `wind_towards` from the one that is given."""
     if not 0.0 <= flags.wind_speed <= _MOST_WIND:
         raise invalid("--wind-speed", f"0 to {_MOST_WIND:g} m/s", flags.wind_speed)
     if None not in (flags.wind_towards, flags.wind_from):
@@ -221,7 +221,7 @@ def _base(flags: argparse.Namespace) -> Table:
 
 
 def _layers(flags: argparse.Namespace) -> dict[str, Layer]:
-    """Reads the rasters, by the name of their flag; refuses different grids."""
+    """Reads the rasters, by the names of their flags; refuses rasters on different grids."""
     choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
     layers = dict[str, Layer]()
     for key in ("elevation", "zones", "no_fly"):
@@ -258,7 +258,7 @@ def _zones(
 def _no_fly(layers: dict[str, Layer]) -> dict[str, NDArray[np.uint8]]:
     """Returns the map of no-fly cells, by its key in the model file.
 
-    Cells without a value are free, as polygons burnt into a raster leave the rest without a value.
+    Cells without a value are free, because rasters made from polygons have no values outside them.
     """
     if "no_fly" not in layers:
         return {}

@@ -36,13 +36,13 @@ class Layer:
     clock: Clock = Clock()
     """The unit of the values, if they are times."""
     flags: tuple[tuple[float, str], ...] = ()
-    """The meanings of single numbers, if the file has them."""
+    """The meanings of single numbers, if the file states them."""
     time: Time | None = None
-    """The time of the layer, if the file has it."""
+    """The time of the layer, if the file states it."""
 
 
 def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str:
-    """Returns the wanted variable of a file, or the only one."""
+    """Returns the name of the wanted variable in a file, or of its only variable."""
     if wanted is not None and wanted in names:
         return wanted
     known = ", ".join(sorted(names)) or "none"

@@ -22,7 +22,7 @@ _SPELLINGS: Final = {
 
 
 class Side(NamedTuple):
-    """The side of a cell from a flag."""
+    """The side of a cell, as given by a flag."""
 
     metres: float
     unit: str

@@ -7,7 +7,7 @@ from emberwatch.errors import InvalidArgumentError
 
 
 def library(name: str, subject: object) -> Any:
-    """Imports a module; `subject` names what needs it in the error, such as a file."""
+    """Imports a module; for the error, `subject` names what needs it, such as a file."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -43,7 +43,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
             yield from _layers(file, variables[name], choice)
     except InvalidArgumentError:
         raise
-    except Exception as error:  # any type: netCDF4 and NumPy differ on damaged bytes
+    except Exception as error:  # netCDF4 and NumPy raise different errors for damaged bytes
         words = getattr(error, "strerror", None) or error
         raise InvalidArgumentError(f"{file}: expected a NetCDF file, got: {words}") from None
 
@@ -153,7 +153,7 @@ def _check_straight(file: Path, variable: Any, axes: dict[str, Axis]) -> None:
 
 
 def _mapping(variable: Any, column: str) -> Attributes:
-    """Returns the attributes of the grid mapping; of the columns' one if there are several."""
+    """Returns the attributes of the grid mapping; if there are several, of the columns' mapping."""
     words = str(attributes(variable).get("grid_mapping", "")).split()
     name = named = ""
     for word in words:
@@ -179,7 +179,7 @@ def _projection(file: Path, mapping: Attributes, *, is_in_degrees: bool) -> str 
     name = mapping.get("grid_mapping_name", "grid mapping")
     try:
         return pyproj.CRS.from_cf({"projected_crs_name": name} | dict(mapping)).to_wkt()
-    except Exception:  # any type: pyproj may fail on any unexpected attribute
+    except Exception:  # pyproj may raise any error for unexpected attributes
         words = ", ".join(f"{key} {value}" for key, value in sorted(mapping.items()))
         return f'"{name}" {words}'
 

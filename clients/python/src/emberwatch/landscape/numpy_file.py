@@ -56,7 +56,7 @@ def _array(file: Path, choice: Choice) -> NDArray[Any]:
             return _checked_array(file, opened)
     except InvalidArgumentError:
         raise
-    except Exception as error:  # any type: NumPy, zipfile, zlib and tokenize on damaged bytes
+    except Exception as error:  # NumPy, zipfile, zlib and tokenize differ on damaged bytes
         raise InvalidArgumentError(f"{file}: expected a NumPy file, got: {error}") from None
 
 

@@ -12,7 +12,7 @@ from emberwatch.landscape.libraries import library
 
 Attributes = Mapping[str, Any]
 
-_ROUNDED: Final = 1e-3  # tolerance of unpacked limits, which are rounded, as a share of a unit
+_ROUNDED: Final = 1e-3  # tolerance for rounded unpacked limits, as a share of the scale factor
 
 
 def attributes(variable: Any) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def unpacked(
 
 
 def _signed(name: str, stored: NDArray[Any], given: Attributes) -> tuple[NDArray[Any], Attributes]:
-    """Returns numbers and attributes in native byte order, with the sign from `_Unsigned`."""
+    """Returns numbers and attributes in native byte order, signed or not as `_Unsigned` states."""
     stored = stored.astype(stored.dtype.newbyteorder("="), copy=False)
     kind = stored.dtype
     if kind.itemsize > 1:  # the default fill value; single bytes have none

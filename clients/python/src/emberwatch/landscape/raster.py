@@ -31,7 +31,8 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
     is_ascii = file.suffix.lower() == ".asc"
     driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
     rasterio, errors = library("rasterio", file), library("rasterio.errors", file)
-    # A file without a position is a valid grid, and GDAL's other warnings do not help users.
+    # GDAL warns about files without a position, which are valid; its other warnings do not help
+    # users.
     with warnings.catch_warnings(action="ignore"):
         try:
             with rasterio.open(Path(utf8("file", file.absolute())), driver=driver) as source:
@@ -58,7 +59,8 @@ def _place(file: Path, source: Any) -> Place:
     (height, width), transform, crs = source.shape, source.transform, source.crs
     if transform.is_identity:
         return Place(shape=source.shape)
-    # Measured over the whole extent, as rotations by tiny angles are rounding errors.
+    # The skew is measured over the whole grid, because rotations by tiny angles are rounding
+    # errors.
     skewed = abs(transform.b) * height, abs(transform.d) * width
     if skewed[0] > LIKE * abs(transform.a) or skewed[1] > LIKE * abs(transform.e):
         raise invalid(file, "rows from west to east", "a rotated grid")
@@ -85,7 +87,7 @@ def _values(file: Path, source: Any, band: int, nodata: Sequence[float]) -> NDAr
 
 
 def _ascii(file: Path, shape: tuple[int, int], nodata: Sequence[float]) -> NDArray[np.float64]:
-    """Parses an ASCII grid. GDAL would pad or cut its numbers, and read words as 0."""
+    """Parses an ASCII grid. GDAL would accept too few or too many numbers, and read words as 0."""
     rows, never = list[NDArray[np.float64]](), ""
     with file.open(encoding="ascii", errors="replace") as lines:
         for line in lines:

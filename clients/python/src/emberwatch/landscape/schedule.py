@@ -15,7 +15,7 @@ SECONDS: Final = {
 }  # fmt: skip
 """The length of each unit in seconds."""
 EVEN: Final = 1e-3
-"""Tolerance of times, as a share of a step: 32-bit numbers are rounded."""
+"""Tolerance for times, as a share of a step, because 32-bit numbers are rounded."""
 
 _SPELLINGS: Final = {
     "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d",
@@ -37,7 +37,7 @@ class Clock(NamedTuple):
     calendar: str = "standard"
 
     def unit(self) -> str | None:
-        """Returns the unit, a key of `SECONDS`; None if the file does not have it."""
+        """Returns the unit, a key of `SECONDS`; None if the file does not state it."""
         unit = _unit(self.words.partition(" since ")[0])
         return unit if unit in SECONDS else None
 
@@ -77,7 +77,7 @@ class Schedule:
     """The times of the layers of one fire, in order."""
 
     def __init__(self, *, step: float, every: int, unit: str | None) -> None:
-        """Starts without layers. `step`: seconds; `unit`: the wanted unit, None for the file's."""
+        """Starts without layers. `step` is in seconds; `unit` is the unit, None for the file's."""
         self._step, self._every, self._wanted = step, every, unit
         self._first_name, self._clock = "", None
         self._unit: str | None = None
@@ -164,7 +164,7 @@ def length(text: str) -> float:
 
 
 def steps_at(times: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Returns the first step at or after each time, counted from 0; infinite times stay."""
+    """Returns the first step at or after each time, from 0; infinite times stay infinite."""
     with np.errstate(over="ignore"):
         steps = np.ceil(times / step - EVEN)
     if (np.isinf(steps) & np.isfinite(times)).any():

@@ -16,7 +16,7 @@ from emberwatch.errors import InvalidArgumentError
 from emberwatch.landscape.compass import facing
 
 MAX_ZONES: Final = 256
-"""Number of different bytes: a map of zones has one byte for each cell."""
+"""Maximum number of zones, because a zone map has one byte for each cell."""
 
 _A: Final = 0.078  # coefficient of slope, per degree
 _C1, _C2 = 0.045, 0.131  # coefficients of wind, per m/s
@@ -28,7 +28,7 @@ _ASPECTS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Zone:
-    """Cells with the same kernels."""
+    """A zone of land: cells that share their kernels."""
 
     name: str
     color: str
@@ -58,8 +58,8 @@ def zones(
     """Groups cells into zones; returns the zone of each cell, shape (H, W), and the zones.
 
     `rise`: the slopes, as from `gradient`. Two cells are in the same zone if their slopes round to
-    the same multiple of `step` degrees, and rise in the same of eight directions. `values`: shape
-    (H, W); cells with different values are in different zones, and cells whose value is in
+    the same multiple of `step` degrees, and rise in the same direction, out of eight. `values`:
+    shape (H, W); cells with different values are in different zones, and cells whose value is in
     `unburnable` never burn.
     """
     labels = np.zeros(shape, np.int64) if values is None else values
@@ -114,7 +114,8 @@ def _kinds(
     steps = np.rint(np.degrees(np.arctan(np.hypot(*slopes))) / step).astype(np.int64)
     aspects = np.rint(np.arctan2(slopes[1], slopes[0]) / (np.pi / 4)).astype(np.int64) % 8
     values, places = np.unique(labels, return_inverse=True)
-    # One number for each cell, as NumPy takes about 30 times as long for rows of three numbers.
+    # Each cell's key is a single number, because NumPy takes about 30 times as long for rows of
+    # three numbers.
     keys = (places.ravel(), steps.ravel(), np.where(steps > 0, aspects, 0).ravel())
     sizes = values.size, int(steps.max()) + 1, 8
     kinds, cells = np.unique(np.ravel_multi_index(keys, sizes), return_inverse=True)
@@ -129,16 +130,16 @@ def _slope_name(degrees: float, aspect: int) -> str:
 
 
 def _color(degrees: float, aspect: int) -> str:
-    """Returns a zone's colour: hue by aspect, darker and less grey if steeper.
+    """Returns a zone's colour. The aspect sets its hue; steeper zones are darker and less grey.
 
-    All are muted, so that the colours of states stand out.
+    All zone colours are muted, so that the colours of states stand out.
     """
     steep = min(degrees / 40, 1.0)
     return _hex(aspect / 8, 0.7 - 0.3 * steep, 0.1 + 0.25 * steep if degrees > 0 else 0.0)
 
 
 def _of_value(value: int) -> str:
-    """Returns the colour of a value. Hues step by the golden ratio, so that close values differ."""
+    """Returns a value's colour. Hues step by the golden ratio, so that close values differ."""
     return _hex(value * 0.618034 % 1.0, 0.6, 0.2)
 
 

@@ -19,7 +19,7 @@ Fill = Callable[[IO[bytes]], object]
 
 
 class State(NamedTuple):
-    """A state in the description."""
+    """A state, as written to the description."""
 
     name: str
     color: str
@@ -32,7 +32,7 @@ STATES: Final = (
     State("burnt", "#4a4a4a", 0.0),
 )
 COLORS: Final[tuple[Color, ...]] = tuple(color_from_hex(state.color) for state in STATES)
-# As in the wildfire model: the sensor errs in 2 % of the cells, with equal shares of both errors.
+# As in the wildfire model, the sensor errs in 2 % of the cells, equally often with each error.
 _RIGHT, _WRONG = 0.98, 0.01
 
 
@@ -64,7 +64,7 @@ def quoted(text: str) -> str:
 
 
 def check_outputs(out: Path, picture: Path | None, *, force: bool) -> None:
-    """Refuses names with wrong endings, and without `force` files that exist already."""
+    """Refuses names with wrong endings and, without `force`, files that exist already."""
     if out.suffix != ".npz":
         raise invalid("--out", "a .npz file", out)
     if picture is not None and picture.suffix != ".png":
@@ -75,7 +75,7 @@ def check_outputs(out: Path, picture: Path | None, *, force: bool) -> None:
 
 
 def check_new(flag: str, file: Path, *, force: bool) -> None:
-    """Refuses a folder, and without `force` a file that exists already."""
+    """Refuses a folder and, without `force`, a file that exists already."""
     if file.is_dir():
         raise invalid(flag, "a file", f"the folder {file}")
     if file.exists() and not force:

@@ -46,7 +46,7 @@ def kernels(
             weights = _even(weights)
         if _spreads(entry, state):
             weights *= factors(zone.rise, speed, towards, weights.shape)
-        # Six digits are more precise than any knowledge of a fire.
+        # Six digits suffice, because no fire's weights are known more precisely.
         rows = [[float(f"{weight:.6g}") for weight in row] for row in weights.tolist()]
         entries.append({"zone": zone.name} | entry | {"weights": rows})
     return entries
@@ -71,7 +71,7 @@ def toml(model: Mapping[str, Any]) -> str:
 
 
 def _spreads(entry: Table, state: str) -> bool:
-    """Returns whether an entry makes neighbours in `state` change cells in other states to it."""
+    """Returns whether a kernel entry spreads `state` from neighbours to cells in other states."""
     weights = entry.get("scale", 1.0) * np.array(entry["weights"], float)
     weights[weights.shape[0] // 2, weights.shape[1] // 2] = 0.0
     return entry["from"] == entry["to"] == state != entry.get("own") and bool(weights.any())

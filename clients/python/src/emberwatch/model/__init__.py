@@ -38,16 +38,16 @@ class Description:
     state_colors: tuple[Color, ...]
     """One colour for each state."""
     observation_names: tuple[str, ...]
-    """One name for each observed value. Names for rings around the path end in the ring, as in
-    `fire ring 1`."""
+    """One name for each observed value. Names of values that are observed in a ring around the path
+    end with the ring, as in `fire ring 1`."""
     observation_colors: tuple[Color, ...]
     """One colour for each observed value."""
     observation_matrix: NDArray[np.float64]
     """``O[state, observed value]``, shape (S, O). The columns are `n_rings` matrices side by side;
     each row of each matrix is a distribution."""
     reward: NDArray[np.float64]
-    """Reward of a cell in each state, shape (S,). A step pays it once for each distinct cell that
-    the robot visited or saw, as `pays` specifies."""
+    """Reward of a cell in each state, shape (S,). A step pays this reward once for each distinct
+    cell that the robot visited or saw, as `pays` specifies."""
     airspace: Airspace
     """Where robots may fly and what they see."""
     toml: str
@@ -74,7 +74,7 @@ class Description:
 
     @property
     def sensor_radius(self) -> int:
-        """Rows and columns that robots see beyond each cell of their path."""
+        """Number of rows and columns that robots see beyond each cell of their path."""
         return self.airspace.radius
 
     @property
@@ -102,7 +102,7 @@ class Description:
 
     @property
     def target_state(self) -> int:
-        """The state with the largest reward (the first of several): fire in the wildfire model."""
+        """The state with the largest reward (the first such state); in the wildfire model, fire."""
         return int(np.argmax(self.reward))
 
     def __eq__(self, other: object) -> bool:
@@ -143,7 +143,7 @@ class Model(Description):
     initial: NDArray[np.float64]
     """Distribution of a cell's state at the start of the burn-in, shape (S,)."""
     edge: int | None
-    """The state of all cells outside the grid; None: they add no weight (``edge`` in the file)."""
+    """State of all cells outside the grid (``edge`` in the file); None: these add no weight."""
     zone_names: tuple[str, ...]
     """Names of the zones of land; empty if the model has no zones."""
     zone_colors: tuple[Color, ...]

@@ -19,7 +19,7 @@ class Airspace:
     """
 
     radius: int = 0
-    """Rows and columns that robots see beyond each cell of their path."""
+    """Number of rows and columns that robots see beyond each cell of their path."""
     n_rings: int = 1
     """Number of observation matrices: one for the path, then one for each ring around it. The last
     one also applies to all rings further out. Matrix m adds ``m * O / n_rings`` to the value that

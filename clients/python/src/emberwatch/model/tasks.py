@@ -16,11 +16,11 @@ class Task:
     """The properties of a task that are known before its worlds exist."""
 
     name: str
-    #: Moves of a path.
+    #: Number of moves in a path.
     n_moves: int
-    #: Robots of each world.
+    #: Number of robots in each world.
     robots: int
-    #: Steps of an episode.
+    #: Number of steps in an episode.
     max_steps: int
     test_seeds: range
     #: Prefix of the ids of its environments, such as `WildfireSmall` in

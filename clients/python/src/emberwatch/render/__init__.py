@@ -1,8 +1,9 @@
 """Pictures of one world: the last frame, the path, and the hidden states if they are known.
 
-`rgb_array` returns an image, and `ansi` a text. `Screen` shows either to people, for
+`rgb_array` returns an image, and `ansi` a text. `Screen` shows an image or a text to people, for
 ``render_mode="human"``. The path of a single robot is dark or light, whichever has more contrast to
-the colours below it, and the robot is a circle of both. Each robot of a team has its own colour.
+the colours below it, and the robot is a circle in dark and light. Each robot of a team has its own
+colour.
 """
 
 import contextlib
@@ -104,7 +105,8 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
 
     Args:
         picture: The contents.
-        scale: Side of a cell in pixels, at least 1. None: panels with a longer side of about 512.
+        scale: Side of a cell in pixels, at least 1. None: the longer side of a panel is about 512
+            pixels.
 
     Returns:
         An image of shape (height, width, 3): red, green, blue.
@@ -138,10 +140,10 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
 def ansi(picture: Picture, *, color: bool = True) -> str:
     """Draws the picture as text for a terminal, hidden states on the right; no final line break.
 
-    With colour (24 bits), a cell is two characters. On grids of more than 32 rows it is half a
-    character, and the path is a tint. Without colour, a cell is two ASCII characters. The first is
-    the value as ``0-9A-Za-z+/``, or ``.`` for an unobserved cell. The second is ``@`` for a robot,
-    ``*`` for a path, ``x`` for a no-fly cell, otherwise a space.
+    With colour (24 bits), a cell is two characters. On grids of more than 32 rows, a cell is half a
+    character, and the path is a tint. Without colour, a cell is two ASCII characters. The first
+    character is the value as ``0-9A-Za-z+/``, or ``.`` for an unobserved cell. The second character
+    is ``@`` for a robot, ``*`` for a path, ``x`` for a no-fly cell, otherwise a space.
     """
     palette, cells, robots = picture.palette, _visited(picture), _cells(picture.robots)
     grids = [(picture.frame, picture.painted(), cells)]
@@ -165,8 +167,8 @@ class Screen:
 
     A window needs pygame and a display (``DISPLAY``, ``WAYLAND_DISPLAY`` or ``SDL_VIDEODRIVER``);
     pygame has one window per process. Without a window, pictures go to the standard output if it is
-    a terminal. Without either, a warning is logged once, and nothing is shown. If the user closes
-    the window, the program continues without pictures.
+    a terminal. Without a window or a terminal, a warning is logged once, and nothing is shown. If
+    the user closes the window, the program continues without pictures.
     """
 
     def __init__(self, *, title: str = "Emberwatch", fps: float = 0.0) -> None:
@@ -251,7 +253,8 @@ def _draw_path(
 ) -> None:
     """Draws a line through the cells' middles, with a square where it begins.
 
-    The line has the colour of each cell in `colors`, dark or light, or one `color`.
+    In each cell, the line has the colour that `colors` gives, dark or light. If `color` is given,
+    the whole line has this colour.
     """
     if not len(cells):
         return
@@ -318,7 +321,7 @@ def _ascii_lines(values: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator
 
 
 def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[str]:
-    """Yields lines in which a cell is two characters on the cell's colour."""
+    """Yields lines in which each cell is two characters on a background of its colour."""
     wide = {" ": "  ", "*": "··", "@": "()", "x": "xx"}
     for line, line_marks in zip(colors.tolist(), marks.tolist(), strict=True):
         cells: list[tuple[str, str]] = []
@@ -329,7 +332,7 @@ def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[
 
 
 def _half_lines(colors: NDArray[np.uint8], robots: NDArray[np.intp]) -> Iterator[str]:
-    """Yields lines of two rows: the upper cell is the foreground, the lower the background."""
+    """Yields lines for two rows of cells: the upper row as foreground, the lower as background."""
     colors = colors.copy()
     colors[tuple(robots.T)] = LIGHT
     for row in range(0, len(colors), 2):

@@ -24,7 +24,7 @@ LIGHT: Final[Color] = (0xFF, 0xFF, 0xFF)
 
 # The three colours of the wildfire model, then Okabe and Ito (2008) with brown instead of orange.
 _COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
-# As on the dashboard: light, so that a dark edge makes each stand out from every cell.
+# As on the dashboard, robots are light, so that a dark edge makes each stand out from every cell.
 _ROBOTS = ("5EE6C8", "FF9AD5", "B9F04A", "8FD0FF", "FFA64D", "C9A8FF", "F5F09A", "D9C2A0")
 _GREYS = (0x30, 0x60, 0x98, 0xE2)  # candidates for unobserved cells
 ROBOTS: Final[tuple[Color, ...]] = tuple(map(color_from_hex, _ROBOTS))
@@ -49,7 +49,7 @@ class Palette:
 
     @classmethod
     def of(cls, source: Description | int, *, on_paper: bool = False, n_rings: int = 1) -> Self:
-        """Makes a palette of described colours, or for a number of observed values.
+        """Makes a palette with a description's colours, or for a number of observed values.
 
         Without a description, eight colours are repeated in turn. `on_paper` prefers a light colour
         for unobserved cells, like the page around them. With `n_rings` observation matrices, the

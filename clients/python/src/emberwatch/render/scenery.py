@@ -16,7 +16,8 @@ from emberwatch.model import Color, color_from_hex
 from emberwatch.model.airspace import Airspace, Zones
 from emberwatch.render.palette import mark_on_each
 
-#: Maximum number of zones with lines and names in legends; more lines would hide the cells.
+#: Maximum number of zones for which lines are drawn and legends list names; more lines would hide
+#: the cells.
 MOST_ZONES: Final = 8
 
 _TINT = 0.4  # share of a zone's colour; states and observations have full colours and stay distinct
@@ -31,7 +32,8 @@ class Scenery:
     """The zones and no-fly cells of a grid, and the range of the sensor. Empty by default."""
 
     n_rings: int = 1
-    """Number of observation matrices. All have the same observations, in the same colours."""
+    """Number of observation matrices. All matrices have the same observations, in the same
+    colours."""
     sees_beyond: bool = False
     """Whether robots see cells beyond their path."""
     no_fly: NDArray[np.bool_] | None = None

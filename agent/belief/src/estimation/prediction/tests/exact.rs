@@ -20,7 +20,7 @@ fn state(joint: usize, cell: usize) -> usize {
     joint / 3_usize.pow(cell as u32) % 3
 }
 
-/// Returns the probability that a cell in a state is observed as a value.
+/// Returns the probability that a cell in the given state is observed as the given value.
 fn likelihood(state: usize, value: usize) -> f64 {
     if state == value { 0.9 } else { 0.05 }
 }
@@ -108,9 +108,9 @@ impl Exact {
     }
 }
 
-/// Simulates worlds whose first cell starts in state 1. Returns the Kullback-Leibler divergence of each kind's beliefs
-/// from the exact beliefs, as the mean over steps and cells. Frames show each cell with probability `1 / one_in`. If
-/// `one_in` is 0, they show no cells.
+/// Simulates worlds whose first cell starts in state 1. For each kind of prediction, returns the Kullback-Leibler
+/// divergence of the beliefs from the exact beliefs, as the mean over steps and cells. Frames show each cell with
+/// probability `1 / one_in`. If `one_in` is 0, frames show no cells.
 pub fn divergences(weights: Weights<'_>, shape: Shape, one_in: u64, n_worlds: u64) -> [f64; 3] {
     let mut states = Grid::zeros(shape.dim());
     states[[0, 0]] = 1;

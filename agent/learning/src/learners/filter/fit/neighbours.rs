@@ -8,7 +8,8 @@ use emberwatch_model::Frame;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Decay factor of the sums per frame of any world. Old sums fade, because they result from worse parameters.
+/// Factor by which the sums decay with each frame of any world. Old frames must lose weight, because they were
+/// evaluated with worse parameters.
 const KEPT: f64 = 1.0 - 1.0 / 4000.0;
 
 /// Learns the correlations of the state with the highest reward.

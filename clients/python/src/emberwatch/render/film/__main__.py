@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         model = _model(flags.model, server)
         begin = None if model is None else partial(_begin, flags.prior, model, server)
         page = Page(server, model, world=flags.world, scale=flags.scale, has_truth=has_truth)
-        with warnings.catch_warnings(action="ignore"):  # `_survey` has reported them
+        with warnings.catch_warnings(action="ignore"):  # `_survey` has printed them
             recorded = steps(recording.read(flags.recording, world=flags.world))
             _write(flags, page, n_scenes, scenes(recorded, selection, begin))
     except (EmberwatchError, OSError) as error:
@@ -158,7 +158,7 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
 
 
 def _model(path: str | None, server: ServerInfo) -> Model | None:
-    """Returns the model that the server revealed, otherwise the model of the file, if any."""
+    """Returns the model that the server revealed, or else the model of the file `path`, if any."""
     if server.model is not None:
         return Model.from_toml(server.model)
     model = None if path is None else Model.named(path)
@@ -178,7 +178,7 @@ def _begin(prior: PriorKind, model: Model, server: ServerInfo, k: int) -> Belief
 
 
 def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterator[Scene]) -> None:
-    """Writes a temporary file next to the output and renames it, so that the output is complete."""
+    """Writes a temporary file next to the output and renames it, so that no output is partial."""
     (width, height), out = page.size, flags.out
     if n_scenes * width * height > _MOST_PIXELS:
         most = _MOST_PIXELS // (width * height)
@@ -207,10 +207,10 @@ def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterato
 
 
 def _pictures(page: Page, scenes: Iterator[Scene], n_scenes: int, fps: float) -> Iterator[Image]:
-    """Draws scenes and sets how long each is shown; the last one and gaps are shown longer."""
+    """Draws scenes and sets how long each is shown: the last scene and gaps are shown longer."""
     for number, scene in enumerate(scenes, 1):
         image = page.indexed(page.draw(scene))
-        millis = 10 * round(100 / fps)  # the unit of GIF
+        millis = 10 * round(100 / fps)  # GIF durations are multiples of 10 ms
         stays = scene.is_gap or number == n_scenes
         image.info["duration"] = max(millis, _PAUSE_MILLIS) if stays else millis
         yield image

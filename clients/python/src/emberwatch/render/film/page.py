@@ -46,7 +46,7 @@ class _Panel:
 
 
 class Page:
-    """The layout of a film, which draws its scenes."""
+    """The layout of a film's pictures, which draws scenes."""
 
     def __init__(
         self,

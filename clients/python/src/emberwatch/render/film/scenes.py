@@ -14,8 +14,8 @@ from emberwatch.client.replies import ServerInfo
 from emberwatch.errors import EmberwatchError
 from emberwatch.model.moves import fly
 
-# Maximum number of missing steps over which the belief is predicted. After a longer gap it starts
-# again: a fire depends on about the last 5,500 steps.
+# Maximum number of missing steps over which the belief is predicted. After a longer gap the belief
+# starts again, because a fire depends only on about the last 5,500 steps.
 _MOST_LOST = 10_000
 _MOST_WAITING = 1 << 26  # maximum number of cells of hidden states that wait for their frames
 
@@ -41,7 +41,8 @@ def steps(records: Iterable[Record]) -> Iterator[Step]:
     """Yields the steps of the records of one world. A frame that was published again counts once.
 
     Warns:
-        UserWarning: If worlds of another kind follow, from another server. They are left out.
+        UserWarning: If worlds of another kind follow, from another server. These worlds are left
+            out.
     """
     server: ServerInfo | None = None
     last: tuple[int, int] | None = None
@@ -96,8 +97,8 @@ class Scene:
         paths: The cells of each robot, `(n, 2)`, its start first.
         belief: The posterior, or in a gap the predictor, `(S, H, W)`; None without a model.
         since: The step at which the belief began.
-        n_lost: Number of missing steps since then.
-        mean_reward: Mean reward of the recorded steps since then.
+        n_lost: Number of missing steps since the belief began.
+        mean_reward: Mean reward of the recorded steps since the belief began.
     """
 
     step: Step
@@ -170,5 +171,5 @@ def _paths(step: Step) -> list[NDArray[np.intp]]:
 
 
 def _kind(server: ServerInfo) -> tuple[object, ...]:
-    """Returns the settings that two servers must share for one filter to follow both."""
+    """Returns the settings in which two servers must agree so that one filter can follow both."""
     return server.height, server.width, server.n_observations, server.model
