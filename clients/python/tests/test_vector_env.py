@@ -253,8 +253,8 @@ def test_vector_wrappers_work() -> None:
     assert [info["step"] for info in recorder.reset(seed=1)[1]] == [0, 0]
 
 
-def test_pictures_equal_those_of_single_environments() -> None:
-    name = WILDFIRE
+@pytest.mark.parametrize("name", [WILDFIRE, OBJECTIVE])
+def test_pictures_equal_those_of_single_environments(name: str) -> None:
     keywords = {**ALL[name], "render_mode": "rgb_array", "truth": True, "max_episode_steps": 3}
     ours, theirs = pair(3, AutoresetMode.NEXT_STEP, name=name, **keywords)
     ours.reset(seed=1)
