@@ -207,7 +207,7 @@ fn a_recording_is_laid_out_as_documented() {
         format!("`{}` in ASCII", recording::MAGIC.escape_ascii()),
         format!("{}; refuse any other", recording::VERSION),
         format!(
-            "version {0} is {1}",
+            "version {1} instead of {0}",
             recording::VERSION,
             recording::VERSION.swap_bytes()
         ),
