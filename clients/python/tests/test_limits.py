@@ -235,7 +235,7 @@ for free in range(60):
     if one is not None: break
     assert "file descriptors, got fewer (the limit is" in said, said
     assert count() == before, f"{count() - before} left behind with {free} free: {said}"
-    needed = said.partition("expected ")[2].partition(" file")[0]
+    needed = said.partition("expected ")[2].partition(" free file")[0]
 one.close()
 print(free, needed, count() - before)
 """

@@ -58,19 +58,15 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
       `"known_model"` without a checkpoint. If fires are rare, learned estimators find several times
       as many burning cells as estimators with a known model.
         * `"known_model"`: the Bayes filter with the true model
-        * `"spatial_filter"`: as `"known_model"`, but observations also correct neighbouring cells
-        * `"second_order_filter"`: as `"known_model"`, but with a second-order approximation of the
-          mean of the ratio in eq. 3
-        * `"cavity_filter"`: as `"known_model"`, but predicts a cell without its own influence on
-          its neighbours
-        * `"spatial_cavity_filter"`: as `"spatial_filter"`, but predicts like `"cavity_filter"`
+        * `"spatial_filter"`: known, where observations also correct neighbouring cells
+        * `"second_order_filter"`: known, with a second-order mean of the ratio in eq. 3
+        * `"cavity_filter"`: known, predicting a cell without its own influence on its neighbours
+        * `"spatial_cavity_filter"`: known+spatial, predicting like known+cavities
         * `"learned_filter"`: a Bayes filter with learned parameters
-        * `"learned_spatial_filter"`: as `"learned_filter"`, but observations also correct
-          neighbouring cells
-        * `"learned_cavity_filter"`: as `"learned_filter"`, but predicts like `"cavity_filter"`
-        * `"learned_spatial_cavity_filter"`: as `"learned_spatial_filter"`, but predicts like
-          `"cavity_filter"`
-        * `"neural_belief"`: a learned network that predicts observations from the last observations
+        * `"learned_spatial_filter"`: learned, where observations also correct neighbouring cells
+        * `"learned_cavity_filter"`: learned, predicting like known+cavities
+        * `"learned_spatial_cavity_filter"`: learned+spatial, predicting like known+cavities
+        * `"neural_belief"`: a learned network that predicts observations from the last ones
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; its
       first computation takes about a second), `"initial"` or `"uniform"`.
