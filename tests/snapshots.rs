@@ -127,7 +127,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
         ("--from 2", "--from: expected a world below 2"),
         (
             "--worlds 3 --takeover",
-            "worlds: expected at least 3, got 2",
+            "worlds: expected a file of at least 3 worlds, got 2",
         ),
         ("--first-world 2 --takeover", "there are robots 0 to 2"),
     ] {
@@ -325,7 +325,7 @@ fn nothing_but_snapshots_is_replaced_and_no_other_run_s() {
     second
         .program
         .ends(1)
-        .check_says("without --restore, got 1 of an earlier run");
+        .check_says("got 1 of an earlier run: continue it with --restore");
 }
 
 #[test]

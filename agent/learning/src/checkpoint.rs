@@ -200,7 +200,7 @@ pub fn read(path: &Path) -> Result<(String, Contents)> {
         let found = std::fs::metadata(path)?;
         ensure!(
             found.is_file(),
-            "expected a regular file, got something else"
+            "expected a regular file, got a folder, pipe or device"
         );
         check_size(found.len())?;
         let mut bytes = Vec::new();

@@ -307,7 +307,7 @@ impl TrainCommand {
         let of_states = self.grid.model_of_states()?;
         ensure!(
             of_states.is_none(),
-            "--model cannot be used with --states: training uses no model"
+            "--model cannot be used with --states: training on recorded states uses no model"
         );
         self.grid.check()?;
         ensure!(

@@ -50,7 +50,7 @@ def check_marks(look) -> None:
     assert share(1, 0.7) < 0.1
     assert share(2, 0.7) < 0.1
     assert share(1, 0.87) > 0.9
-    assert 0.3 < share(2, 0.87) < 0.7
+    assert 0.3 < share(2, 0.87) < 0.8
     path = look.picture(".shown.robots")[0]["path"]
     line = pixels[tuple(((np.array(path[3:9]) + 0.5) * scale).astype(int).T)]
     # A line between two rows of pixels covers a part of the dark edge.

@@ -189,7 +189,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     *(({"seeds": it}, "seeds: expected at least one seed, without dup") for it in ([], [4, 4])),
     ({"seeds": 8}, r"seeds: expected several seeds, such as range\(8\), got 8"),
     *(
-        ({name: value}, f"{name}: expected to be left out, as evaluate sets it")
+        ({name: value}, f"{name}: evaluate sets it; leave it out")
         for name, value in {
             "reward": "move", "num_envs": 2, "max_episode_steps": 9, "autoreset_mode": "SameStep",
         }.items()

@@ -212,7 +212,7 @@ def test_known_refuses_wrong_arguments() -> None:
 
 FRAME = np.full((16, 16), 255, np.uint8)
 TRUTH = np.zeros((16, 16), np.uint8)
-WORLDS = "worlds: expected a mask or indices of 3 worlds, or a slice, got "
+WORLDS = "worlds: expected a mask of 3 worlds, indices from 0 to 2, or a slice, got "
 
 
 def of_frame(value: int) -> NDArray[np.uint8]:

@@ -230,7 +230,7 @@ def test_a_film_skips_other_worlds_and_repeated_records(studio: Studio) -> None:
 
 #: Wrong flags, each with words of its error.
 WRONG: list[tuple[list[object], str]] = [
-    (["--world", 7], "--world: expected a recorded world, [0, 1], got 7"),
+    (["--world", 7], "--world: expected one of the recorded worlds 0, 1, got 7"),
     (["--step", 9], "expected some of the recorded steps 0 to 1, 4 to 4, got 9 to 9"),
     (["--from", 5], "expected some of the recorded steps 0 to 1, 4 to 4, got 5 to inf"),
     (["--from", 5, "--to", 4], "--to: expected 5 to inf, got 4"),

@@ -109,7 +109,9 @@ impl Sequences {
     /// Adds the arrays of a `.npz` archive, sorted by name.
     pub fn add_archive(&mut self, mut archive: impl Read + Seek) -> Result<(), String> {
         let n_entries = n_entries(&mut archive).map_err(|error| error.to_string())?;
-        let unfit = |error| format!("expected a .npz archive: {error}");
+        let unfit = |error| {
+            format!("expected a .npz (zip) archive, got another or a damaged file ({error})")
+        };
         let mut archive = ZipArchive::new(archive).map_err(unfit)?;
         let mut names: Vec<String> = archive.file_names().map(String::from).collect();
         if let Some(got) = n_entries.filter(|&n| n != names.len()) {
@@ -299,7 +301,7 @@ fn check_regular(path: &Path) -> Result<u64, String> {
     if metadata.is_file() {
         Ok(metadata.len())
     } else {
-        Err("expected a regular file, got something else".into())
+        Err("expected a regular file, got a folder, pipe or device".into())
     }
 }
 

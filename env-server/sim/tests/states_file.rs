@@ -231,9 +231,9 @@ fn broken_archives_are_refused_each_by_its_problem() {
     }
     let turned = npy(&sequence(0, (2, 4, 3)));
     for (bytes, words) in rows! {
-        whole.clone() => "expected a .npz archive: ";
-        Vec::new() => "expected a .npz archive: ";
-        deflated[..deflated.len() / 2].to_vec() => "expected a .npz archive: ";
+        whole.clone() => "expected a .npz (zip) archive, got another or a damaged file (";
+        Vec::new() => "expected a .npz (zip) archive, got another or a damaged file (";
+        deflated[..deflated.len() / 2].to_vec() => "expected a .npz (zip) archive, got another or a damaged file (";
         stored(&[]) => "expected at least one array, got none";
         two("a.txt", &whole) => "expected only .npy members, got \"a.txt\"";
         two("two.npy", &turned) => "array \"two\": expected 3 x 4 cells, as in the first array, got 4 x 3";
@@ -256,7 +256,7 @@ fn what_is_no_file_or_has_no_description_is_refused() {
         let error = StatesFile::read(path).expect_err(words).to_string();
         assert!(error.contains(words), "{error:?} does not say {words:?}");
     };
-    let other = "expected a regular file, got something else";
+    let other = "expected a regular file, got a folder, pipe or device";
     check(&folder.path().join("gone.npz"), "gone.npz: No such file");
     let words = "expected .npz or .npy files in the folder, got none";
     check(folder.path(), words);

@@ -227,8 +227,8 @@ pub enum ModelError {
     },
     /// The transition weights of a cell can all be so small that eq. 3 divides by rounding errors.
     #[error(
-        "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to {share:e} of \
-         the largest weight, expected at least {LEAST_SHARE:e} whatever its neighbourhood"
+        "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to {share:e} times \
+         the largest weight, expected at least {LEAST_SHARE:e} times for every neighbourhood: raise the small weights"
     )]
     FaintWeight {
         /// The model's name.

@@ -33,7 +33,7 @@ impl WorldForm {
         let (expected, got) = (self.n_matrices, n_matrices);
         ensure!(
             got == expected,
-            "checkpoint: expected the {expected} observation matrices of the world's sensor, got {got}"
+            "checkpoint: expected the {expected} observation matrices of the world's sensor, got {got}: give the model that it was trained with"
         );
         Ok(())
     }

@@ -228,7 +228,9 @@ pub fn file_stem(policy: &str) -> String {
 pub fn check_entries(entries: &[Entry]) -> Result<()> {
     let mut all = entries.iter();
     let floor = all.find(|entry| entry.about.policy == FLOOR);
-    let floor = floor.with_context(|| format!("expected an entry of {FLOOR}, got none"))?;
+    let floor = floor.with_context(|| {
+        format!("expected an entry of {FLOOR}, whose reward is score 0: add its results first")
+    })?;
     let mut known = BTreeSet::new();
     check_scale(entries)?;
     for entry in entries {

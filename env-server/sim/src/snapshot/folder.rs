@@ -44,7 +44,8 @@ impl Folder {
         FileError {
             path: self.path.display().to_string(),
             problem: format!(
-                "expected no snapshots of instance {instance:?} without --restore, got {n_files} of an earlier run"
+                "expected no snapshots of instance {instance:?}, got {n_files} of an earlier run: continue it with \
+                 --restore, or choose another folder"
             ),
             is_damaged: false,
         }

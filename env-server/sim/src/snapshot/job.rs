@@ -71,7 +71,7 @@ pub fn load(
     if let Some(worlds) = worlds {
         let got = snapshot.worlds.len();
         if worlds.end > got {
-            let expected = format!("at least {}", worlds.end);
+            let expected = format!("a file of at least {} worlds", worlds.end);
             return Err(refused(path, SnapshotError::n_worlds(expected, got)));
         }
         snapshot.worlds = snapshot.worlds.drain(worlds).collect();

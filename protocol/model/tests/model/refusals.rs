@@ -62,7 +62,7 @@ scale = 1.0, weights = [[1.0]] => scale = 1e-99, weights = [[1e-99]] => expected
 scale = 1.0 => scale = nan => expected finite weights >= 0, got NaN
 scale = 1.0 => scale = -1.0 => expected finite weights >= 0, got -1
 scale = 1.0 => scale = 0.0 => transition weights of cell (0, 0) can sum to zero
-scale = 1.0, weights = [[1.0]] => weights = [[1e30]] => transition weights of cell (0, 0) can sum to 4.9999999999999995e-31 of the largest weight
+scale = 1.0, weights = [[1.0]] => weights = [[1e30]] => transition weights of cell (0, 0) can sum to 4.9999999999999995e-31 times the largest weight
 from = "b", to = "a" => from = "b", to = "ash" => kernel entry names state "ash"
 from = "b", to = "a" => from = "a", to = "a" => transition weights of cell (0, 0) can sum to zero
 own = "b", from = "b", to = "a" => own = "ash", from = "b", to = "a" => kernel entry names state "ash"

@@ -235,7 +235,9 @@ class Belief:
     def _chosen(self, worlds: ArrayLike | slice | None) -> NDArray[np.bool_]:
         """Returns the mask of the chosen worlds."""
         chosen = np.zeros(self._shape[0], np.bool_)
-        expected = f"a mask or indices of {len(chosen)} worlds, or a slice"
+        expected = (
+            f"a mask of {len(chosen)} worlds, indices from 0 to {len(chosen) - 1}, or a slice"
+        )
         index = slice(None) if worlds is None else worlds
         if not isinstance(index, slice):
             index = as_array(index, "worlds", expected)

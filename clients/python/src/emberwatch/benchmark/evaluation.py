@@ -423,7 +423,7 @@ def _check(
             raise invalid(what, "at least 1", repr(number))
     for what in _SET:
         if what in keywords:
-            raise InvalidArgumentError(f"{what}: expected to be left out, as evaluate sets it")
+            raise InvalidArgumentError(f"{what}: evaluate sets it; leave it out")
     if not isinstance(seeds, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise invalid("seeds", "several seeds, such as range(8)", repr(seeds))
     chosen = [as_seed(seed) for seed in seeds]

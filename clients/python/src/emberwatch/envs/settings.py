@@ -376,7 +376,7 @@ def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
         if n_rows != 1:
             raise InvalidArgumentError("robot: expected None, as all robots of a world are flown")
         if not 0 <= settings.robot < n_robots:
-            raise invalid("robot", f"0 to {n_robots - 1}", settings.robot)
+            raise invalid("robot", f"0 to {n_robots - 1}" if n_robots > 1 else "0", settings.robot)
         return range(first + settings.robot, first + settings.robot + 1)
     n_rows = n_robots if n_rows is None else n_rows
     if n_rows // n_robots * n_robots != n_rows:

@@ -63,7 +63,9 @@ def _place(file: Path, source: Any) -> Place:
     # errors.
     skewed = abs(transform.b) * height, abs(transform.d) * width
     if skewed[0] > LIKE * abs(transform.a) or skewed[1] > LIKE * abs(transform.e):
-        raise invalid(file, "rows from west to east", "a rotated grid")
+        raise invalid(
+            file, "rows from west to east", "a rotated grid; reproject it (gdalwarp -t_srs)"
+        )
     far = transform * (width, height)
     return Place(
         shape=source.shape,

@@ -134,7 +134,8 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
     if server is None and not worlds and caught:
         raise EmberwatchError(str(caught[-1].message), "recording")
     if server is None:
-        raise invalid("--world", f"a recorded world, {sorted(worlds)}", flags.world)
+        recorded = ", ".join(map(str, sorted(worlds)))
+        raise invalid("--world", f"one of the recorded worlds {recorded}", flags.world)
     if n_steps == 0:
         known = ", ".join(f"{first} to {last}" for first, last in runs[:_MOST_NAMED])
         more = ", ..." if len(runs) > _MOST_NAMED else ""
