@@ -85,7 +85,7 @@ impl Place {
         rows.collect()
     }
 
-    /// Compares policies on small worlds with a checkpoint.
+    /// Runs `compare` on small worlds, with the checkpoint in folder `out`.
     pub fn compare(&self, out: &str, flags: &str) -> Ended {
         agent(&format!("compare {COMPARED} {} {flags}", self.flag(out)))
     }

@@ -107,8 +107,8 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
     learner.learned()
 }
 
-/// Returns how far predictions from known states are from the true model's predictions: each cell's largest difference
-/// in probability, averaged over the cells in each state, and then over the states.
+/// Returns the error of predictions from known states, against the true model's. A cell's error is the largest
+/// difference in probability over its next states; the mean is over the cells in each state, then over the states.
 fn distance(model: &Model, tables: &Tables) -> f64 {
     let mut dynamics = Dynamics::new(model, shape()).expect("a valid model");
     let (mut sums, mut counts) = ([0.0; 3], [0.0; 3]);

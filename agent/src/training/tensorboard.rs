@@ -19,7 +19,7 @@ const FILE_VERSION: &str = "brain.Event:2";
 /// `SessionLog.START`: TensorBoard discards earlier events for this step and later steps, even in older files.
 const SESSION_START: u64 = 1;
 
-/// Number of the colour space RGB in `Summary.Image`.
+/// The value of `colorspace` in `Summary.Image` that means RGB.
 const RGB: u64 = 3;
 
 #[derive(Debug, Clone, Copy, PartialEq)]

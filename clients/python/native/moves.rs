@@ -33,8 +33,8 @@ pub fn moves<'py>(
     moves.transpose()
 }
 
-/// Returns integers below `n_choices`, one per row, as bytes; `None` unless they are valid and in a plain array of
-/// `int64`.
+/// Converts an array of choices, one per row, to bytes. Returns `None` unless it is a plain `int64` array of values from
+/// 0 to `n_choices - 1`.
 #[pyfunction]
 pub fn choices<'py>(
     given: &Bound<'py, PyAny>,

@@ -124,7 +124,7 @@ def test_ctrl_c_ends_a_blocked_step_but_not_the_client() -> None:
     with ctrl_c() as raised:
         lease.step([3] * 6, timeout=LONG)
     started.wake_up()
-    # `raised` still holds the traceback, as an `except` block does.
+    # `raised` keeps the traceback alive, as an exception does inside an `except` block.
     before = client.observe().result().world.step
     assert raised is not None
     assert lease.step([3] * 6).result().world.step == before + 1

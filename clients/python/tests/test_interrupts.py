@@ -1,4 +1,4 @@
-"""Ctrl-C and raising signal handlers, at every moment of an environment's call."""
+"""Ctrl-C, and signal handlers that raise, at every moment of a call to an environment."""
 
 import gc
 import sys
