@@ -90,7 +90,7 @@ def test_the_readme_trains_and_scores_a_policy(tmp_path: Path) -> None:
     page = (FOLDER.parents[2] / "README.md").read_text("utf-8")
     code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
     assert code is not None
-    short = code[1].replace("500_000", "2_048").replace("steps=100", "steps=5")
+    short = code[1].replace("100_000", "2_048").replace("steps=100", "steps=5")
     done = subprocess.run(
         [sys.executable, "-c", short], capture_output=True, text=True, timeout=900, cwd=tmp_path
     )
