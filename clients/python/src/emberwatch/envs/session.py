@@ -4,21 +4,17 @@ A session opens no worlds before the first reset, so that an environment can be 
 and used in a forked child, as in Gymnasium's `AsyncVectorEnv`.
 """
 
-import inspect
-import os
 import threading
-import warnings
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch._native import FIRST_TRAINING_SEED
 from emberwatch.client import wire
 from emberwatch.client.client import Client, connect, embed_settings
 from emberwatch.client.connection import RESET_TIMEOUT
@@ -26,16 +22,21 @@ from emberwatch.client.lease import Lease
 from emberwatch.client.observer import Newest, Present, Truth, TruthReader
 from emberwatch.client.replies import LeftBelief
 from emberwatch.client.wire import StepAnswer, WorldResult
+from emberwatch.envs.advice import (
+    about_barren_worlds,
+    warn,
+    warn_of_test_worlds,
+    warn_without_rewards,
+)
+from emberwatch.envs.fork_lock import ForkLock
 from emberwatch.envs.settings import Settings, WorldSpec, own_spec, running_spec
 from emberwatch.errors import (
     EmberwatchError,
     LeaseLostError,
     RequestTimeoutError,
     ServerGoneError,
-    TrainingOnTestWorldsWarning,
     invalid,
 )
-from emberwatch.model.tasks import Task
 
 # Seconds without use after which a lease on a running server expires. It is long because learners
 # may pause between steps. The server notices a dead client at once anyway.
@@ -43,21 +44,6 @@ _LEASE: Final = 3600.0
 
 #: Errors after which the session no longer holds its worlds, or does not know their step.
 LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
-
-
-#: Number of forks between the first process and this one.
-_n_forks = 0
-#: Held by a thread of a forked child while it replaces the lock of a session.
-_fork_lock = threading.Lock()
-
-
-def _count_fork() -> None:
-    global _n_forks, _fork_lock
-    _n_forks, _fork_lock = _n_forks + 1, threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_count_fork)
 
 
 class State(Enum):
@@ -105,7 +91,7 @@ class Session:
         self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
         self._state = State.CLOSED
-        self._made_after, self._turn = _n_forks, threading.RLock()
+        self._turn = ForkLock()
         #: Whether test worlds are allowed without a warning, as in an evaluation.
         self.allows_test_worlds = False
         # Only worlds in which other clients fly can move without this session's path.
@@ -124,23 +110,12 @@ class Session:
         self._worlds: Final = range(settings.world, settings.world + n_worlds)
         if settings.truth and settings.instance and n_worlds > wire.TRUTH_BUFFER:
             raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", n_worlds)
-        described = self.spec.described
-        if described is not None and not described.reward.any():
-            kind = "model" if self.spec.description is None else "description"
-            _warn(
-                f"{kind} {described.name!r}: no state pays: every reward will be 0; give a state "
-                f"a `reward` in the {kind}'s file"
-            )
+        warn_without_rewards(self.spec)
 
     @property
     def turn(self) -> threading.RLock:
         """A lock, for `with` statements, that lets only one thread at a time step or reset."""
-        if self._made_after != _n_forks:
-            with _fork_lock:
-                if self._made_after != _n_forks:
-                    # The lock's holder may be a thread that does not exist in a forked child.
-                    self._turn, self._made_after = threading.RLock(), _n_forks
-        return self._turn
+        return self._turn.lock
 
     @property
     def instance(self) -> str:
@@ -163,13 +138,6 @@ class Session:
     def is_unfinished(self) -> bool:
         """Whether worlds may have moved unobserved, so that all must be reset or resumed."""
         return self._state in _UNFINISHED
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Omits the lock, so that a copy does not wait for threads of this session."""
-        return {name: value for name, value in vars(self).items() if name != "_turn"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _turn=threading.RLock())
 
     def begin_step(self) -> None:
         """Begins a step; refuses it before a reset, or after a call that did not finish."""
@@ -368,48 +336,20 @@ class Session:
             lease.reset(seeds, worlds=[self._worlds[index] for index in indices])
             self._state = State.MOVED
             answer = self._observe()
-        self._warn_of_barren(answer)
+        if not self._has_warned and (advice := about_barren_worlds(self.spec, answer)):
+            self._has_warned = True
+            warn(advice)
         return answer
 
-    def _warn_of_barren(self, answer: StepAnswer) -> None:
-        """Warns once if worlds begin without a cell in the state that pays most."""
-        worlds = answer.worlds
-        barren = np.flatnonzero((worlds["n_target_cells"] == 0) & (worlds["step"] == 0))
-        if self._has_warned or self.spec.is_recorded or not len(barren):
-            return
-        self._has_warned = True
-        _warn(
-            f"no cell of world {barren[0]} is in the state that pays most (the same in "
-            f"{len(barren)} of {len(worlds)} worlds): use a longer burn_in, a larger grid, or a "
-            "model for small grids, model='wildfire-small'"
-        )
-
     def _warn_of_test_worlds(self, seeds: Sequence[int]) -> None:
-        task = self.spec.task
-        if (
-            task is None
-            or self.allows_test_worlds
-            or not any(it in task.test_seeds for it in seeds)
-        ):
+        if self.allows_test_worlds:
             return
         try:
-            self._warn_of_task(task)
+            warn_of_test_worlds(self.spec.task, seeds)
         except Warning:  # a warnings filter raised it as an error: nothing has changed yet
             if self._state is State.BEGUN:
                 self._state = State.READY if self.is_open else State.CLOSED
             raise
-
-    def _warn_of_task(self, task: Task) -> None:
-        tests, others = task.test_seeds, max(FIRST_TRAINING_SEED, task.test_seeds.stop)
-        # Attributed to this line instead of the caller's, so that Python shows it once per process.
-        warnings.warn(
-            f"task {task.name!r}: an episode begins on a test world (seeds {tests.start} to "
-            f"{tests.stop - 1}); train on seeds from {others} on, with reset(seed={others}) or a "
-            f"trainer's seed={others}; to test, use emberwatch.benchmark.evaluate, or ignore "
-            "emberwatch.TrainingOnTestWorldsWarning with warnings.filterwarnings",
-            TrainingOnTestWorldsWarning,
-            stacklevel=1,
-        )
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
         """Closes the session after a loss, so that a reset opens it again.
@@ -477,14 +417,6 @@ class Session:
 
 def _without_model(spec: WorldSpec) -> WorldSpec:
     return replace(spec, model=None, description=None)
-
-
-def _warn(message: str) -> None:
-    """Warns at the caller's line: the innermost one outside this package and Gymnasium."""
-    frame, level = inspect.currentframe(), 1
-    while frame and frame.f_globals["__name__"].partition(".")[0] in ("emberwatch", "gymnasium"):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(message, stacklevel=level)
 
 
 def not_reset() -> EmberwatchError:
