@@ -162,7 +162,7 @@ run --task ash => task ash: No such file";
         Task::named(&file).expect("a task of a built-in name");
         folder.write(name, "");
         let words =
-            format!("{setting}: expected a file whose name is not a built-in one, got {name}");
+            format!("{setting}: {name} is a built-in name and also a file next to the task");
         check(SERVER, &format!("--task {file}"), &words);
     }
 }

@@ -261,7 +261,8 @@ fn replay(n_frames: u64) -> BlockReplay {
     replay
 }
 
-fn dimensions(sees_own_state: bool) -> Dimensions {
+/// Returns the dimensions of a filter for the wildfire model.
+pub fn dimensions(sees_own_state: bool) -> Dimensions {
     Dimensions {
         n_states: 3,
         n_observations: 3,

@@ -1,7 +1,8 @@
 //! Learns kernels that depend on the cell's own state, from frames of a model with such kernels.
 
+use crate::learned_filter::dimensions;
 use emberwatch_belief::Belief;
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::parameters::{Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_learning::beliefs::learned::LearnedModel;
 use emberwatch_learning::config::AgentConfig;
@@ -16,16 +17,6 @@ const N_MOVES: u64 = 64;
 
 fn shape() -> Shape {
     Shape::new(24, 24).expect("test shape")
-}
-
-fn dimensions(sees_own_state: bool) -> Dimensions {
-    Dimensions {
-        n_states: 3,
-        n_observations: 3,
-        kernel: (3, 3),
-        sees_own_state,
-        n_matrices: 1,
-    }
 }
 
 /// A simulated world, and the belief of a filter that follows a robot through it.

@@ -178,17 +178,17 @@ impl Task {
             ("model", &mut task.model, is_model),
             ("states", &mut task.states, is_states),
         ] {
-            let beside = folder.join(&*file);
-            if file.is_empty() || !beside.exists() || (is_built_in && beside.is_dir()) {
+            let next_to_task = folder.join(&*file);
+            if file.is_empty() || !next_to_task.exists() || (is_built_in && next_to_task.is_dir()) {
                 continue;
             }
             if is_built_in {
                 return Err(format!(
-                    "{setting}: expected a file whose name is not a built-in one, got {file}: rename it, or write ./{file}"
+                    "{setting}: {file} is a built-in name and also a file next to the task: write ./{file}, or rename the file"
                 ));
             }
-            check_kind(&beside).map_err(|problem| format!("{setting}: {problem}"))?;
-            *file = beside.display().to_string();
+            check_kind(&next_to_task).map_err(|problem| format!("{setting}: {problem}"))?;
+            *file = next_to_task.display().to_string();
         }
         Ok(task)
     }

@@ -18,7 +18,7 @@ pub struct History {
     steps: VecDeque<PastStep>,
 }
 
-/// Returns the size in bytes of a history of `n_steps` steps, in each of which each of `n_robots` robots observes up to
+/// Returns the size in bytes of a history of `n_steps` steps. In each step, each of `n_robots` robots observes up to
 /// `most_seen` cells.
 pub fn bytes_of_history(n_steps: usize, n_robots: usize, most_seen: usize) -> usize {
     let of_robot = size_of::<PastRobot>() + 5 * most_seen;
@@ -47,7 +47,7 @@ pub struct PastRobot {
 }
 
 impl History {
-    /// Creates a history for `n_steps` steps (at least one), in each of which each of `n_robots` robots observes up to
+    /// Creates a history for `n_steps` steps, at least one. In each step, each of `n_robots` robots observes up to
     /// `most_seen` cells.
     pub fn new(n_steps: usize, n_robots: usize, most_seen: usize) -> Self {
         let n_steps = n_steps.max(1);

@@ -114,7 +114,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
         Args:
             seed: The seed s of the first world; world i gets s + i. Or a sequence with one seed for
-                each row, of which a world uses the seed of its first row. None: each world's own
+                each row; a world uses the seed of its first row. None: each world's own
                 generator draws a seed.
             options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
                 robots of a world; or `resume`, see `WildfireEnv`.
