@@ -13,8 +13,8 @@ const TOP: f64 = 132.0;
 /// Height of the tick labels and the axis label.
 const BOTTOM: f64 = 72.0;
 /// Maximum widths of a row's label and of its value. Longer text is shortened.
-const MAX_LABEL: f64 = 360.0;
-const MAX_VALUE: f64 = 200.0;
+const MAX_LABEL_WIDTH: f64 = 360.0;
+const MAX_VALUE_WIDTH: f64 = 200.0;
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ladder {
@@ -95,10 +95,10 @@ impl Plot {
         let widest = |width: &dyn Fn(&Bar) -> f64| bars.iter().map(width).fold(0.0, f64::max);
         let label =
             |bar: &Bar| TextStyle::LABEL.width(&bar.name) + TextStyle::NOTE.width(&bar.remark);
-        let values = widest(&|bar| TextStyle::LABEL.width(&bar.label)).min(MAX_VALUE);
+        let values = widest(&|bar| TextStyle::LABEL.width(&bar.label)).min(MAX_VALUE_WIDTH);
         let seeds = bars.iter().flat_map(|bar| &bar.worlds).map(|world| world.0);
         Self {
-            left: MARGIN + widest(&label).min(MAX_LABEL) + 14.0,
+            left: MARGIN + widest(&label).min(MAX_LABEL_WIDTH) + 14.0,
             right: WIDTH - MARGIN - values - 24.0,
             bottom: TOP + ROW * bars.len() as f64,
             axis: Axis::covering(bars.iter().flat_map(Bar::extent), 8),
@@ -120,7 +120,7 @@ impl Bar {
 
     fn draw(&self, page: &mut Svg, plot: &Plot, middle: f64) {
         self.draw_label(page, plot, middle);
-        let label = TextStyle::LABEL.fit(&self.label, MAX_VALUE);
+        let label = TextStyle::LABEL.fit(&self.label, MAX_VALUE_WIDTH);
         page.text(
             (WIDTH - MARGIN, middle),
             Align::Right,
@@ -162,7 +162,7 @@ impl Bar {
 
     fn draw_label(&self, page: &mut Svg, plot: &Plot, middle: f64) {
         let right = plot.left - 14.0;
-        let remark = TextStyle::NOTE.fit(&self.remark, MAX_LABEL / 2.0);
+        let remark = TextStyle::NOTE.fit(&self.remark, MAX_LABEL_WIDTH / 2.0);
         let width = TextStyle::NOTE.width(&remark);
         page.text((right, middle), Align::Right, TextStyle::NOTE, &remark);
         let name = TextStyle::LABEL.fit(&self.name, right - MARGIN - width + 1.0);

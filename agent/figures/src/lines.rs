@@ -22,7 +22,7 @@ const TITLE: f64 = 30.0;
 const LABEL_GAP: f64 = 20.0;
 const LEADER: f64 = 28.0;
 /// Maximum width of a name. Longer names are shortened.
-const MAX_LABEL: f64 = 230.0;
+const MAX_LABEL_WIDTH: f64 = 230.0;
 /// Opacity of an error band.
 const BAND: f64 = 0.18;
 /// Maximum share of the plot's height for the shaded background.
@@ -180,7 +180,7 @@ impl DrawnCurve {
             let edges = edges.filter(|edges| edges.iter().all(|&edge| is_drawable(edge)));
             band.extend(edges.map(|edges| (x, edges)));
         }
-        let name = TextStyle::LABEL.fit(&curve.name, MAX_LABEL);
+        let name = TextStyle::LABEL.fit(&curve.name, MAX_LABEL_WIDTH);
         (!points.is_empty()).then_some(Self {
             name,
             color,

@@ -8,7 +8,7 @@ use roxmltree::Document;
 
 const BLUE: Color = Color(0x00, 0x72, 0xb2);
 
-/// Checks for valid XML, finite numbers, and texts inside the page's margin. Returns the texts.
+/// Checks for valid XML, finite numbers, and texts at least 19 points from the left and right edges. Returns the texts.
 fn check(svg: &str) -> Vec<String> {
     assert!(!svg.contains("NaN") && !svg.contains("inf\""), "{svg}");
     let document = Document::parse(svg).expect("XML");

@@ -105,8 +105,9 @@ impl Contents {
     /// If the tensor is missing, has a different shape, or contains non-finite values.
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         let tensor = self.tensors.get(name);
-        let tensor =
-            tensor.with_context(|| format!("{name}: expected a tensor {expected:?}, got none"))?;
+        let tensor = tensor.with_context(|| {
+            format!("{name}: expected a tensor of shape {expected:?}, got none")
+        })?;
         let (shape, got) = (format!("shape {expected:?}"), format!("{:?}", tensor.shape));
         check(tensor.shape == expected, name, shape, got)?;
         check_numbers(name, &tensor.numbers, expected.iter().product())?;
@@ -316,6 +317,17 @@ pub fn check(fits: bool, name: &str, expected: impl Display, got: impl Display) 
 /// Creates an error about a tensor or a field of the state.
 pub fn wrong(name: &str, expected: impl Display, got: impl Display) -> anyhow::Error {
     anyhow!("{name}: expected {expected}, got {got:#}")
+}
+
+/// Checks a saved number of updates that are due. The maximum exceeds the number that one step of all worlds can add.
+pub fn check_earned(earned: f64) -> Result<()> {
+    const MAX: f64 = 2e6;
+    check(
+        (0.0..MAX).contains(&earned),
+        "earned",
+        format!("0 to {MAX}"),
+        earned,
+    )
 }
 
 pub fn check_counts(counts: &[(&str, u64)]) -> Result<()> {

@@ -17,8 +17,8 @@ use toml::{Table, Value};
 /// Every setting with its default and meaning.
 const DEFAULTS: &str = include_str!("../agent.toml");
 
-/// The authors' settings that differ from the defaults: positions clamped once after all moves are summed, a uniform
-/// first belief, and constant step sizes for the autoencoder and the DQN.
+/// The authors' settings that differ from the defaults: moves summed without regard to the grid, with each partial sum
+/// clamped, a uniform first belief, and constant step sizes for the autoencoder and the DQN.
 const PAPER: &str = r#"
 shooting_integration = "clamp_sum"
 prior = "uniform"

@@ -52,7 +52,7 @@ pub fn of_checkpoint(name: &str) -> Result<&'static LearnerKind> {
     let kind = kinds.find(|kind| kind.checkpoints.contains(&name));
     kind.with_context(|| {
         let names = listed(LEARNERS.iter().map(|kind| kind.checkpoints[0]));
-        format!("expected a checkpoint of kind {names}, got kind {name}")
+        format!("expected a checkpoint of one of the kinds {names}, got {name}")
     })
 }
 

@@ -104,7 +104,7 @@ impl BlockReplay {
         self.full.get(&number)
     }
 
-    /// Stores the belief at the end of a block as the start of the track's next block.
+    /// Stores the belief at the end of a block as the start of the track's next block, if that block can be replayed.
     pub fn hand_on(&mut self, number: u64, belief: &[f32]) {
         let Some(next) = self.full.get(&number).map(|block| block.next) else {
             return;

@@ -40,8 +40,8 @@ impl Crop {
         })
     }
 
-    /// Returns the crop with the given side lengths, centred on `extent`. A crop that would leave the aligned grid is moved
-    /// inside.
+    /// Returns the crop with the given side lengths, centred on `extent` up to the alignment. A crop that would leave
+    /// the aligned grid is moved inside.
     pub(crate) fn around(shape: Shape, sides: [usize; 2], extent: &Extent) -> Self {
         let whole = Self::whole(shape);
         let first = [0, 1].map(|axis| {

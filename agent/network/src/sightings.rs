@@ -161,7 +161,8 @@ impl Features {
     /// Returns the number of features of a cell. The features are, in this order:
     ///
     /// - one-hot codes of the last observation, weighted by its freshness on three time scales (3 per observation)
-    /// - a one-hot code of the second-latest observation, weighted by its freshness (1 per observation)
+    /// - a one-hot code of the second-latest observation, weighted by its freshness on the middle time scale (1 per
+    ///   observation)
     /// - whether the cell was never seen, the logarithm of its age, whether it is inside the grid, and the freshness of
     ///   the second-latest observation on the longest time scale
     pub fn n_channels(n_observations: usize) -> usize {

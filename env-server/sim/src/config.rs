@@ -66,7 +66,7 @@ pub struct Checked {
     /// The model, which has no transitions if the worlds show recorded states.
     pub model: Model,
     pub shape: Shape,
-    /// The free cells that robots can reach.
+    /// How many free cells no-fly cells cut off, and which fixed starts they enclose.
     pub reach: Reach,
     pub recorded: Option<CheckedStates>,
 }

@@ -189,7 +189,7 @@ impl Embedded {
 }
 
 /// Answers requests as a server does. Unlike a request to a server, `control_text` can be interrupted. After a
-/// `shutdown` request, every call fails with [`ConnectionError::ServerGone`].
+/// `shutdown` request, every later request fails with [`ConnectionError::ServerGone`].
 impl Backend for Embedded {
     fn info(&self) -> &ServerInfo {
         &self.info

@@ -40,7 +40,7 @@ pub fn check_memory(checked: &Checked, n_threads: usize) -> Result<(), NoMemory>
     let n_at_once = (n_worlds + n_threads.min(n_worlds)) as u64;
     let n_bytes = n_at_once.saturating_mul(bytes_of_world(checked) as u64);
     let n_bytes = n_bytes.saturating_add(answer_bytes(checked) as u64);
-    // Adds an eighth for the overhead of allocators, which was measured.
+    // Adds an eighth for the overhead of allocators, which measurements showed to be enough.
     let n_bytes = n_bytes.saturating_add(n_bytes / 8);
     let worlds = if n_worlds == 1 { "world" } else { "worlds" };
     let what = format!("{n_worlds} {worlds} of {} cells", checked.shape);

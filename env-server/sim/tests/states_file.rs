@@ -26,8 +26,7 @@ observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#
 /// A valid header of an array.
 const HEADER: &str = "{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4), }\n";
 
-/// its replacement => the expected error`. => Rows of three fields: `part of the header => its replacement => the
-/// expected error`. => its replacement => the expected error`.
+/// Rows of three fields: a part of [`HEADER`] => its replacement => a part of the expected error.
 const WRONG_HEADERS: &str = "
 |u1 => <f4 => expected dtype '|u1' (uint8), got '<f4'
 |u1 => |i1 => expected dtype '|u1' (uint8), got '|i1'

@@ -52,7 +52,7 @@ pub enum Status {
     Malformed = 3,
     /// The server has no such world; detail: number of worlds.
     NoSuchWorld = 4,
-    /// The payload does not have the length in the header; detail: bytes expected.
+    /// The length of the payload does not fit the header; detail: bytes expected.
     WrongLength = 5,
     /// The path does not have the server's number of moves; detail: moves expected.
     WrongPathLength = 6,
@@ -63,7 +63,8 @@ pub enum Status {
     /// The lease was taken over, expired or released; detail: pid of the client that took over the robot or holds it
     /// now, or 0 if there is no such client.
     LeaseLost = 9,
-    /// Another client holds a robot; detail: its pid.
+    /// Another client holds a robot; detail: its pid. For a step: a path of the robot is already waiting; detail: the
+    /// client's own pid.
     Busy = 10,
     /// A world is being reset; detail: the world.
     Resetting = 11,

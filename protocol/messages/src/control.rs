@@ -133,7 +133,7 @@ pub enum Reply {
         path: String,
         /// The length of the file in bytes.
         n_bytes: u64,
-        /// The worlds in the file, with their steps at the time of writing.
+        /// The worlds in the file, at the steps that the file contains.
         worlds: Vec<WorldInfo>,
     },
     /// Answers `restore` and `fork`: the worlds after the replacement.

@@ -52,10 +52,7 @@ pub enum ChannelError {
         instance: String,
     },
     /// A server runs on the instance, but it speaks another version of the protocol.
-    #[error(
-        "protocol version mismatch: the client speaks {VERSION}, the server {version}; use a client and a server of the \
-         same release"
-    )]
+    #[error("{}", Status::version_mismatch(VERSION, u64::from(*.version)))]
     OtherVersion {
         /// The server's protocol version.
         version: u32,

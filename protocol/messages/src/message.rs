@@ -108,7 +108,8 @@ pub struct WorldResult {
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of the rewards of the distinct cells that any robot visited, each in its state in `X_{k+1}`.
+    /// Sum of the rewards of the distinct cells that any robot visited (or saw, if the model pays for seen cells), each
+    /// in its state in `X_{k+1}`.
     pub reward: f64,
     /// Bit r is set if no client held robot r of the world. A robot that nobody holds stays in its cell and sees
     /// nothing.
@@ -120,11 +121,11 @@ pub struct WorldResult {
     pub n_target_cells: u32,
     /// Number of distinct cells that any robot visited.
     pub n_visited: u32,
-    /// Number of distinct visited cells in the state with the highest reward.
+    /// Number of distinct rewarded cells in the state with the highest reward.
     pub n_hits: u32,
     /// 1 if the episode ended by itself (never, in this model), otherwise 0.
     pub terminated: u16,
-    /// 1 if the episode reached the server's `max_steps`, otherwise 0.
+    /// 1 if the episode reached the server's `max_steps` or the last recorded step, otherwise 0.
     pub truncated: u16,
 }
 
@@ -132,13 +133,13 @@ pub struct WorldResult {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct RobotResult {
-    /// The robot's share of the team's reward: a cell that v robots visited pays 1/v of its reward to each.
+    /// The robot's share of the team's reward: a cell that v robots visited (or saw) pays 1/v of its reward to each.
     pub reward: f64,
     /// The robot's marginal contribution: the team's reward minus the team's reward without this robot.
     pub marginal: f64,
     /// Number of distinct cells that the robot visited.
     pub n_visited: u32,
-    /// Number of distinct visited cells in the state with the highest reward.
+    /// Number of the robot's distinct rewarded cells in the state with the highest reward.
     pub n_hits: u32,
     /// Row where the path began, or where the robot stays.
     pub start_row: u32,

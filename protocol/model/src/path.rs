@@ -25,7 +25,7 @@ pub enum Move {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Flight {
     /// Row-major indices of the distinct cells flown over, in the order of the first visit. The start cell is among
-    /// them only if the path returns to it, or if a move off the grid leaves the robot there.
+    /// them only if the path returns to it, or if a move off the grid or into a no-fly cell leaves the robot there.
     pub visited: Vec<usize>,
     /// The robot's last cell.
     pub end: Cell,

@@ -207,7 +207,7 @@ impl Task {
         if !is_file_name(&self.name) {
             return needs(
                 "name",
-                "1 to 64 letters, digits, - and _",
+                "1 to 64 letters, digits, '-', '_' and '.', not starting with '.'",
                 &format!("{:?}", self.name),
             );
         }

@@ -81,7 +81,7 @@ fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), Channel
             return Ok(());
         };
         if start.elapsed() > UNFINISHED {
-            let problem = "a process is creating it, or is stopped: continue or kill the process";
+            let problem = "a process is creating it, perhaps one that is stopped: continue or kill that process";
             return Err(directory_error(&segment, problem.into()));
         }
         std::thread::sleep(INTERVAL);

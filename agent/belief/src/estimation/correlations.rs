@@ -144,7 +144,7 @@ impl Evidence {
 
 impl Sums {
     /// Adds the products of the innovations and of the scales of two seen cells, if these are at most [`RADIUS`]
-    /// columns apart.
+    /// columns apart. They must be at most [`RADIUS`] rows apart.
     fn add(&mut self, one: &Evidence, other: &Evidence) {
         let down = one.cell.row.abs_diff(other.cell.row);
         let across = one.cell.col.abs_diff(other.cell.col);
@@ -158,7 +158,7 @@ impl Sums {
 }
 
 impl Default for Correlations {
-    /// Returns the correlations before the first frame: all are zero, so that cells are independent.
+    /// Returns the correlations before the first frame: zero between different cells, so that these are independent.
     fn default() -> Self {
         let mut correlations = Self {
             sums: Sums([[[Sum::default(); N_CLASSES]; N_AGES]; N_AGES]),
@@ -177,7 +177,7 @@ impl TryFrom<Sums> for Correlations {
             |sum: &Sum| sum.products.abs() < MOST && (0.0..MOST).contains(&sum.largest);
         if !sums.0.as_flattened().as_flattened().iter().all(is_possible) {
             return Err(
-                "sums of correlations: expected magnitudes below 1e15 and no negative scales",
+                "sums of correlations: expected products between -1e15 and 1e15 and scales from 0 to 1e15, got others",
             );
         }
         let mut correlations = Self {

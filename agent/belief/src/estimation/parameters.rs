@@ -1,5 +1,5 @@
 //! The parameters of a learned filter, stored as unconstrained values: weights `w >= 0`, the observation probabilities
-//! `P(y | x)`, and the initial belief `u_0`.
+//! `P(y | x)`, and the first belief `u_0`.
 //!
 //! `w` is the softplus of the first tensor. Each row of `P(y | x)` is the softmax of a row of the second tensor, and
 //! `u_0` is the softmax of the third. Unconstrained values are clamped to ±[`BOUND`], so that no weight or probability

@@ -54,7 +54,7 @@ impl SpatialFilter {
     /// Wraps a filter. Corrections to the probability of `state` (the *paying state*, which has the highest reward) are
     /// spread to neighbours.
     ///
-    /// Each frame updates `correlations`. The default correlations are zero.
+    /// Each frame updates `correlations`. With the default, different cells are uncorrelated at first.
     ///
     /// # Panics
     /// If the filter has no such state.

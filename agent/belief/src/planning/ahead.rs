@@ -64,7 +64,8 @@ fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
             promise[[row, col]] = promise[[row, col]].max(passed_on);
         }
     };
-    // One pass down and to the right, then one pass back. On an open grid, this covers all shortest paths.
+    // One pass down and to the right, then one pass back. On an open grid, they cover a shortest path between any
+    // two cells.
     for (row, col) in cells.clone() {
         spread(
             (row, col),

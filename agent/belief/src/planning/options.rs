@@ -275,7 +275,8 @@ fn features(
 
 /// Returns the name of each feature:
 ///
-/// - sums of probability, entropy and novelty over the path's distinct cells, per move
+/// - sums of probability, entropy and novelty over the path's distinct cells (over the seen cells, for layers that count
+///   in sight), per move
 /// - scaled sums of all layers over the region at the path's end, and over the region at the goal
 /// - distance to the goal, as a fraction of the grid's sides
 /// - scaled surplus of the best region and of the robot's region, and the scaled mean probability of the grid

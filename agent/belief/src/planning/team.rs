@@ -1,6 +1,6 @@
 //! A joint plan for several robots. A cell that one robot visits is worth nothing to its teammates.
 //!
-//! The robots plan one after the other, each on the values that remain after its teammates' paths. Then each robot
+//! The robots plan one after the other, each on the values that remain after the paths before it. Then each robot
 //! plans again, given all other paths (best response), and keeps the better of its two paths. The team's value
 //! therefore never decreases.
 

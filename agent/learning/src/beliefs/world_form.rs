@@ -33,7 +33,8 @@ impl WorldForm {
         let (expected, got) = (self.n_matrices, n_matrices);
         ensure!(
             got == expected,
-            "checkpoint: expected the {expected} observation matrices of the world's sensor, got {got}: give the model that it was trained with"
+            "checkpoint: expected the {expected} observation matrices of the world's sensor, got {got}: the checkpoint \
+             belongs to worlds with another sensor"
         );
         Ok(())
     }

@@ -116,7 +116,7 @@ fn errors_name_the_kind_format_tensor_or_state() {
     let got = contents();
     for (name, words) in [
         ("kernel", "kernel: expected shape [4], got [2, 2]"),
-        ("bias", "bias: expected a tensor [4], got none"),
+        ("bias", "bias: expected a tensor of shape [4], got none"),
     ] {
         assert_eq!(got.tensor(name, &[4]).expect_err(name).to_string(), words);
     }

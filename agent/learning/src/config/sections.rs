@@ -47,7 +47,7 @@ pub struct LearningConfig {
 pub enum KernelKind {
     /// The states of the neighbours (paper eq. 4).
     Neighbours,
-    /// The states of the neighbours and of the cell itself: there is one kernel for each state of the cell itself.
+    /// The states of the neighbours and of the cell itself (its *own state*), with one kernel for each own state.
     Own,
 }
 

@@ -255,9 +255,9 @@ impl Optimiser {
         }
     }
 
-    /// Adds the gradient of the log-prior `anchor * ln P(y | x)`, where y is the most likely observation of state x
-    /// from the path. The paper assumes that "there is a state which is observable with negligible uncertainties"
-    /// (section III.E, remark).
+    /// Adds the gradient of the negative log-prior `-anchor * ln P(y | x)`, where y is the most likely observation of
+    /// state x in the sensor's first matrix, which applies to cells on the path. The paper assumes that "there is a
+    /// state which is observable with negligible uncertainties" (section III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
         let dimensions = self.dimensions();
         let (n_observations, n_of_matrix) = (dimensions.n_observations, dimensions.n_of_matrix());

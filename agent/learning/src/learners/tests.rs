@@ -259,7 +259,7 @@ fn errors_name_what_does_not_fit_a_neural_belief() {
     refused(&left, two, "n_observations: expected 2, got 3");
     let mut without = left.clone();
     without.tensors.remove("head.bias");
-    let words = "head.bias: expected a tensor [3], got none";
+    let words = "head.bias: expected a tensor of shape [3], got none";
     refused(&without, worlds(), words);
     let mut squares = left.clone();
     let tensor = squares.tensors.get_mut("adam.second.head.bias");

@@ -67,8 +67,8 @@ pub fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
     policies
 }
 
-/// Returns the policies for a table of all options on one belief: random moves, then each option, the rule, and the
-/// learned choice unless the belief is an oracle.
+/// Returns the policies for a table of all options on one belief: random moves, then each option, the rule, and, if
+/// frames correct the belief, the learned choice.
 pub fn options_table(belief: &'static BeliefKind, model: &Model) -> Vec<Policy> {
     let options = OPTIONS.iter().map(Goal::Option).chain([Goal::Rule]);
     let learned = (belief.input == Input::Frames).then_some(Goal::Learned);

@@ -62,8 +62,8 @@ impl Dqn {
         Ok(())
     }
 
-    /// Resumes the saved track of an episode. If the track has a different [`n_step`](super::DqnSettings::n_step),
-    /// returns an empty track.
+    /// Resumes the saved track of an episode. Returns an empty track if the saved one has a different
+    /// [`n_step`](super::DqnSettings::n_step), or more open steps than such a track can have.
     ///
     /// # Errors
     /// If a step does not fit the DQN.
@@ -96,7 +96,7 @@ impl Dqn {
         let flaw = if is_finite {
             ""
         } else {
-            " and a number that is not finite"
+            ", with a number that is not finite"
         };
         Err(NetworkError::Transition {
             at,

@@ -236,7 +236,7 @@ fn what_another_dqn_saved_is_refused_by_name_and_changes_nothing() {
         ),
         (
             |it| it.1.transitions[7].next[0] = f32::NAN,
-            "action 0, discount 0.5 and a number that is not finite",
+            "action 0, discount 0.5, with a number that is not finite",
         ),
         (
             |it| it.1.transitions[7].discount = 1.5,

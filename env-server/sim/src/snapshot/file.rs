@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use thiserror::Error;
 
 /// The error for pipes, devices, folders and links.
-const NOT_A_FILE: &str = "expected a regular file, got a folder, pipe or device";
+const NOT_A_FILE: &str = "expected a regular file, got a folder, link, pipe or device";
 
 /// Ending of a file's name while it is being written.
 pub(super) const PART: &str = ".part";

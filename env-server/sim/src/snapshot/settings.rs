@@ -123,12 +123,13 @@ impl Settings {
         if self.model != server.model {
             let pairs = server.model.lines().zip(self.model.lines());
             let line = pairs.into_iter().find(|(expected, got)| expected != got);
-            let (expected, got) = line.unwrap_or(("as many lines", "fewer or more lines"));
-            return Err(other(
-                "model",
-                &format!("{:?}", start_of(expected)),
-                &format!("{:?}", start_of(got)),
-            ));
+            let n_lines = |text: &str| format!("{} lines", text.lines().count());
+            let start_of = |line| format!("{:?}", start_of(line));
+            let (expected, got) = line.map_or_else(
+                || (n_lines(&server.model), n_lines(&self.model)),
+                |(expected, got)| (start_of(expected), start_of(got)),
+            );
+            return Err(other("model", &expected, &got));
         }
         // The task's name is not compared, because the same settings may come from a task or from flags.
         let others = server.others.iter().filter(|(name, _)| name != TASK);

@@ -33,7 +33,7 @@ pub struct Rules {
     /// Episode length in steps. If it is 0, episodes are never truncated.
     pub max_steps: u64,
     pub start: Start,
-    /// Number of past steps whose frames are kept.
+    /// Number of latest steps, including the current one, whose frames are kept.
     pub history: usize,
     /// Number of moves in a path.
     pub n_moves: usize,

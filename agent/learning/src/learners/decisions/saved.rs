@@ -4,7 +4,7 @@ use super::base::{Base, belief_of_saved};
 use crate::beliefs::learned::{LearnedModel, SavedModel};
 use crate::beliefs::neural::{NeuralModel, SavedNeuralModel};
 use crate::beliefs::{BeliefKind, NEURAL};
-use crate::checkpoint::{Contents, check, check_counts, check_numbers};
+use crate::checkpoint::{Contents, check, check_counts, check_earned, check_numbers};
 use crate::learned::Learned;
 use crate::learners::resume_point::ResumePoint;
 use crate::policy::LearnedDecisions;
@@ -19,9 +19,6 @@ use std::sync::Arc;
 
 /// The shape of the DQN: features per option, and number of options.
 pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
-
-/// Maximum number of updates that can be due. It exceeds the number that one step of all worlds can add.
-const MAX_EARNED: f64 = 2e6;
 
 /// Maximum number of steps for which an option is held.
 const LONGEST_HOLD: u64 = 1000;
@@ -162,8 +159,7 @@ impl SavedDecisions {
             ("dqn.n_updates", self.dqn.n_updates),
             ("world_steps", self.world_steps),
         ])?;
-        let fits = (0.0..MAX_EARNED).contains(&self.earned);
-        check(fits, "earned", format!("0 to {MAX_EARNED}"), self.earned)?;
+        check_earned(self.earned)?;
         contents.check_squares()?;
         dqn.load(|name, shape| contents.tensor(name, shape), &self.dqn)
     }

@@ -5,7 +5,7 @@ mod neighbours;
 pub use self::neighbours::Neighbours;
 
 use crate::beliefs::learned::{LearnedModel, dimensions_of, named_tensors, read_parameters};
-use crate::checkpoint::{Contents, check, check_counts};
+use crate::checkpoint::{Contents, check, check_counts, check_earned};
 use crate::config::{AgentConfig, KernelKind, LearningConfig};
 use crate::gradient::{Optimiser, Update};
 use crate::learners::base::lacks_steps;
@@ -20,9 +20,6 @@ use serde::{Deserialize, Serialize};
 
 /// Suffixes of tensor names: parameters, mean gradients and mean squared gradients.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
-
-/// Maximum number of updates that can be due. It exceeds the number that one step of all worlds can add.
-const MAX_EARNED: f64 = 2e6;
 
 /// A filter that is fitted to frames as they arrive. A checkpoint stores this struct, and its tensors separately.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -185,8 +182,7 @@ impl FilterFit {
         saved.load(contents, dimensions)?;
         let mut fit = Self::new(dimensions, shape, config);
         if saved.optimiser.cut() == fit.optimiser.cut() {
-            let fits = (0.0..MAX_EARNED).contains(&saved.earned);
-            check(fits, "earned", format!("0 to {MAX_EARNED}"), saved.earned)?;
+            check_earned(saved.earned)?;
             fit.earned = saved.earned;
             let (n_states, n_observations) = (dimensions.n_states, dimensions.n_observations);
             let replay = &mut fit.replay;
@@ -344,7 +340,7 @@ mod tests {
         );
         forged(
             |contents, _| drop(contents.tensors.remove("initial.first_moment")),
-            "initial.first_moment: expected a tensor [3], got none",
+            "initial.first_moment: expected a tensor of shape [3], got none",
         );
         forged(
             |contents, _| {

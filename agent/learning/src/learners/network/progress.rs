@@ -54,7 +54,7 @@ pub struct SavedNetwork {
     pub dqn: SavedDqn,
     /// The frames of the replay buffer, oldest first.
     pub frames: Vec<Vec<u8>>,
-    /// Index of the first frame of each track.
+    /// Index of the first frame of each track except the oldest.
     pub tracks: Vec<u64>,
     pub position: Position,
 }

@@ -4,7 +4,7 @@ use super::behaviour::Behaviour;
 use super::replay::LessonReplay;
 use crate::beliefs::learned::{LearnedModel, SavedModel};
 use crate::beliefs::neural::{NeuralModel, new_network, read_corrected};
-use crate::checkpoint::{Contents, check, check_counts};
+use crate::checkpoint::{Contents, check, check_counts, check_earned};
 use crate::learners::resume_point::ResumePoint;
 use crate::reward::RewardEstimate;
 use anyhow::Result;
@@ -13,9 +13,6 @@ use emberwatch_network::{Device, NeuralBelief};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-
-/// Maximum number of updates that can be due. It exceeds the number that one step of all worlds can add.
-const MAX_EARNED: f64 = 2e6;
 
 /// A checkpoint of a neural belief, without its tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -75,8 +72,7 @@ impl SavedNeural<'_> {
 
     /// Checks that the saved runs and frames fit the grid and the observations.
     pub(super) fn check_worlds(&self) -> Result<()> {
-        let fits = (0.0..MAX_EARNED).contains(&self.earned);
-        check(fits, "earned", format!("0 to {MAX_EARNED}"), self.earned)?;
+        check_earned(self.earned)?;
         let (shape, n) = (self.shape, self.n_observations);
         let robots = self.worlds.keys().copied();
         self.replay.check(shape, n, self.filter.is_some(), robots)?;
