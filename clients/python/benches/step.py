@@ -178,7 +178,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument(
-        "--busy", type=int, nargs="+", help="only single steps, next to N busy processes"
+        "--busy",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="only single steps, next to N busy processes",
     )
     args = parser.parse_args()
     if args.busy is None:

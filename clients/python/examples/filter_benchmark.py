@@ -31,7 +31,7 @@ from emberwatch.model import Model
 
 SIDE = 25
 HEALTHY, BURNING, BURNT = range(3)
-RATES = np.linspace(0.1, 0.4, SIDE)  # probability of ignition a, by column
+RATES = np.linspace(0.1, 0.4, SIDE)  # a: probability of ignition per burning neighbour, by column
 BURNS_ON = float(np.exp(-0.1))
 Fire = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # states and frames, both [K, 25, 25]
 

@@ -216,7 +216,7 @@ class Training:
 
 
 class Log:
-    """A CSV file whose rows are means over the values added since the last row."""
+    """A CSV file with `COLUMNS`; its means are over the values added since the last row."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, default=100, help="steps per episode")
-    parser.add_argument("--folder", help="folder of data sets; default: a temporary one")
+    parser.add_argument("--folder", help="folder of data sets; None: a temporary one")
     args = parser.parse_args()
     os.environ["MINARI_DATASETS_PATH"] = args.folder or tempfile.mkdtemp(prefix="emberwatch-")
     import minari  # reads MINARI_DATASETS_PATH

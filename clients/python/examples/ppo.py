@@ -321,7 +321,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--horizon", type=int, default=32, help="moves per rollout")
     parser.add_argument("--batch", type=int, default=512)
     parser.add_argument("--epochs", type=int, default=4)
-    parser.add_argument("--value-rounds", type=int, default=5, help="rollouts that train the value")
+    parser.add_argument("--value-rounds", type=int, default=5, help="first rollouts: value only")
     parser.add_argument("--learning-rate", type=float, default=7e-4)
     parser.add_argument("--gamma", type=float, default=0.95)
     parser.add_argument("--lambda", dest="lambda_", type=float, default=0.9)

@@ -174,7 +174,7 @@ def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
 def main() -> None:
     """Trains on a cluster; by default, on two nodes on this machine."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--address", help="a running cluster; default: start two nodes here")
+    parser.add_argument("--address", help="a running cluster; None: start two nodes here")
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--runners", type=int, default=4, help="at most 15 per node")
     parser.add_argument("--worlds", type=int, default=8, help="worlds per runner")

@@ -138,7 +138,7 @@ def learner(envs: VecEnv, seed: int) -> DQN:
 def main() -> None:
     """Trains a DQN, then compares it with simple choices on test worlds."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--checkpoint", help="a learned filter's; default: the known model")
+    parser.add_argument("--checkpoint", help="of a learned filter; None: the known model")
     parser.add_argument("--model", default="wildfire-latent")
     parser.add_argument("--moves", type=int, default=12)
     parser.add_argument("--burn-in", type=int, default=6_000)

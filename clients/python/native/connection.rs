@@ -156,8 +156,8 @@ impl Server {
     }
 
     /// Returns whether a step of this number of robots is expected to be so short that it can keep the interpreter
-    /// locked. Otherwise, getting the interpreter back from a busy thread can take 5 ms. Returns `false` before the
-    /// first step, when no duration is known.
+    /// locked. Otherwise, getting the interpreter back from a busy thread can take 5 ms. Returns `false` on
+    /// a connection to a server, and before the first step, when no duration is known.
     pub fn is_brief(&self, n_robots: u32) -> bool {
         let nanos = self.nanos_of_robot.load(Ordering::Relaxed);
         self.is_embedded && nanos > 0 && nanos.saturating_mul(n_robots.into()) < BRIEF_NANOS

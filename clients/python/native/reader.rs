@@ -53,7 +53,7 @@ impl<H: Header + Published> Reading<H> {
             };
             let header = &sample.header;
             let next = self.next.insert(header.publisher(), header.sequence() + 1);
-            // A number below the expected one means that a new server publishes, so nothing was lost.
+            // A number below the expected one means that a new server publishes, so no loss is counted.
             n_lost += next.map_or(0, |next| header.sequence().saturating_sub(next));
             if self.world.is_none_or(|world| world == header.world()) {
                 return Ok(Some((sample, n_lost)));

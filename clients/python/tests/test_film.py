@@ -217,10 +217,13 @@ def test_recorded_worlds_have_the_colours_of_their_description(studio: Studio) -
     assert (cells(image, 1)[seen] == colors[SEEN[seen]]).all()
 
 
-def test_a_film_skips_other_worlds_and_repeated_records(studio: Studio) -> None:
+def test_a_cut_recording_is_shown_up_to_the_cut(studio: Studio) -> None:
     words = studio.film([server(), frame(0), frame(1), frame(2)], cut=True)
     assert "warning" in words and "cut short" in words
     assert len(studio.millis()) == 2
+
+
+def test_a_film_skips_other_worlds_and_repeated_records(studio: Studio) -> None:
     records = [server(), frame(0), server(pid=9), frame(0), server(pid=7, model=None), frame(1)]
     assert "worlds of another kind follow" in studio.film(records)
     assert len(studio.millis()) == 1, "two alike"

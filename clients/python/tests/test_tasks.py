@@ -206,7 +206,7 @@ def test_a_suite_is_scored_next_to_the_programs_policies(tmp_path: Path) -> None
     assert "| mine " in done.stdout, done
     for keywords, words in (
         ({"worlds": 0}, "worlds: expected at least 1, got 0"),
-        ({"steps": 3}, "steps: expected to be left out, as suite sets it"),
+        ({"steps": 3}, "steps: suite sets it; leave it out"),
         ({"tasks": ["ash"]}, "task ash: No such file"),
     ):
         with refuses(words):

@@ -1,8 +1,8 @@
 //! States files: recorded hidden states as NumPy arrays, with a description. See docs/recorded-worlds.md.
 //!
 //! An array's header is checked before its values are read or decompressed. The allocated memory grows with the bytes
-//! that are present, not with the size that a header claims. Values are read into their final place; only an array in Fortran order
-//! is copied once more.
+//! that are present, not with the size that a header claims. Values are read into their final place; only an array in
+//! Fortran order is copied once more.
 
 use emberwatch_model::built_in::STATES;
 use emberwatch_model::grid::Shape;

@@ -214,7 +214,7 @@ pub enum ModelError {
     /// The transition weights of a cell can all be zero: eq. 3 would divide by zero.
     #[error(
         "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to zero, \
-         expected a positive sum whatever its neighbourhood: give the centre of the kernel a \
+         expected a positive sum for every neighbourhood: give the centre of the kernel a \
          positive weight from every state, or give a state a bias"
     )]
     ZeroWeight {

@@ -135,7 +135,7 @@ class Answer:
 
     @property
     def world_of_robots(self) -> NDArray[np.int64]:
-        """The index in `worlds` of each robot's world, `(n_robots,)`."""
+        """The index of each robot's world among the answer's worlds, `(n_robots,)`."""
 
     def result(self, index: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """Returns the fields of one robot's `WorldResult` and `RobotResult`."""
@@ -194,7 +194,7 @@ class Server:
         body: bytes,
         seconds: float,
     ) -> Answer:
-        """Sends a raw request on the channel `step`."""
+        """Sends a raw request to the service `step`."""
 
     def close(self) -> None:
         """Closes the connection. May be called again."""
@@ -251,7 +251,7 @@ class Options:
         """Drops all beliefs. May be called again."""
 
 class Flights:
-    """The incomplete path of each robot, one row for each robot.
+    """The current path of each robot, up to its latest move; one row for each robot.
 
     `reward` is the reward of each state. If given, each cell pays the reward of its hidden state
     when the path first visits it, or first sees it if the airspace pays for seen cells. A copied or
@@ -302,7 +302,7 @@ class Flights:
         """Returns the mask of the rows whose next move completes their path."""
 
     def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Returns each row's path with one more move, `(n_rows, T)`; does not make the move."""
+        """Returns the paths that `actions` complete as last moves, `(n_rows, T)`; makes no move."""
 
     def made(self, row: int) -> NDArray[np.uint8]:
         """Returns the moves made by one robot."""

@@ -33,9 +33,9 @@ def beam_search(
         rng: Generator that breaks ties; one number is drawn for each world.
         visited: Nonzero in cells that have no value, because they were visited before. Shape
             (n, H, W).
-        width: Number of paths kept after each move, 1 to 65,536; fewer if they would need more
-            than 4 GiB. Among paths that visited the same cells and end in the same cell, only one
-            is kept.
+        width: Number of paths kept after each move, 1 to 65,536. The maximum is lower if that
+            many would need more than 4 GiB; a larger width is refused. Among paths that visited
+            the same cells and end in the same cell, only one is kept.
         airspace: Where the robots may fly, such as `env.world_spec.airspace`. None: everywhere. If
             its `pays` is `"seen"`, all cells within the sensor's view of the path count.
 

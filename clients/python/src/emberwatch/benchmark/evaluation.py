@@ -184,7 +184,7 @@ def suite(
     """
     for keyword in ("task", "seeds", "steps", "csv"):
         if keyword in keywords:
-            raise InvalidArgumentError(f"{keyword}: expected to be left out, as suite sets it")
+            raise InvalidArgumentError(f"{keyword}: suite sets it; leave it out")
     if worlds is not None and (as_integer(worlds) or 0) < 1:
         raise invalid("worlds", "at least 1", repr_of(worlds))
     by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None

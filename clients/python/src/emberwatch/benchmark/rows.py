@@ -47,7 +47,7 @@ class Row:
     robots: int = 1
     #: What the robots share: `alone` (nothing), `shared` (what they see), or a word of your choice.
     team: str = "alone"
-    #: Share of the visits that went to cells which another robot visited in the same step.
+    #: Share of the visits that repeat another robot's visit to the same cell in the same step.
     mean_repeated: float = 0.0
     #: The first of the figures of merit (docs/figures-of-merit.md): number of steps until a robot
     #: first visited a burning cell. None if no robot ever did, and in rows of old files.

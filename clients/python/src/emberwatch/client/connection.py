@@ -98,7 +98,7 @@ class ServerConnection(Connection):
         *,
         timeout: float,
     ) -> StepAnswer:
-        """Sends a raw request on the channel `step`. Prefer `Lease.step` and `observe`."""
+        """Sends a raw request to the service `step`. Prefer `Lease.step` and `observe`."""
         n_moves = self.info.n_moves if operation == wire.STEP else 0
         place = first_robot, n_robots
         answer = self._native.step(operation, lease, *place, n_moves, flags, body, timeout)

@@ -10,7 +10,7 @@ from emberwatch._native import Answer
 from emberwatch.common.codes import N_MOVES as N_MOVES
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
 
-#: Operations of the channel `step`.
+#: Operations of the service `step`.
 STEP: Final = 1
 OBSERVE: Final = 2
 RECALL: Final = 3

@@ -122,7 +122,7 @@ class WildfireEnv(WorldEnv):
       given with it. With `instance`, it must be the task of the running server.
     * `model`: the name of a built-in model (`"wildfire"`) or the path of a model file.
     * `height`, `width` (64), `n_moves` (64; the T above), `burn_in` (10,000), `sensor_radius`
-      (None: the model's), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): for worlds
+      (None: the model's), `start` (`"corner"`; or `"centre"`, `"random"`, `"ROW,COL"`): for worlds
       in this process. With `instance`, leave them out or repeat the server's values.
     * `states`: recorded states instead of a model: the name of built-in states, a `.npz` or `.npy`
       file, or a folder (see `docs/recorded-worlds.md`). Recorded states determine `height`, `width`

@@ -205,7 +205,7 @@ class WorldSpec:
     burn_in: int
     #: Where robots may fly and what they see.
     airspace: Airspace
-    #: Zones of land, for pictures; None if there are no zones, or a running server hides them.
+    #: Zones of land, for pictures; None if there are no zones.
     zones: Zones | None
     #: Number of robots in each world.
     n_robots: int
