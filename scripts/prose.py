@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import re
 import subprocess
 import sys
-import tokenize
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from proselint.checks import __register__ as STANDARD
@@ -15,6 +13,8 @@ from proselint.config import DEFAULT
 from proselint.registry import CheckRegistry
 from proselint.registry.checks import Check, types
 from proselint.tools import LintFile
+from pygments.lexers import get_lexer_for_filename
+from pygments.token import Token
 
 #: Advice, and the phrases to avoid as a regular expression, in which a space matches any white space.
 PHRASES = {
@@ -27,8 +27,8 @@ PHRASES = {
     "write instead of": r"\bin the place of\b",
     "say what applies instead": r"\bexpected none\b",
 }
-#: Disabled checks of proselint, which concern matters of taste, lists of simple words, or repeated words (a heading may
-#: repeat words).
+#: Disabled checks of proselint: matters of taste, lists of simple words, forms of dates, and repeated words (a heading
+#: may repeat words).
 OFF = ("typography", "hyperbole", "weasel_words", "restricted", "lexical_illusions", "dates_times")
 OURS = [
     Check(
@@ -38,78 +38,49 @@ OURS = [
     )
     for advice, pattern in PHRASES.items()
 ]
+ANY = re.compile("|".join(PHRASES.values()).replace(" ", r"\s+"), re.IGNORECASE)
 OUR_CHECKS = {"emberwatch": True}
 ALL_CHECKS = OUR_CHECKS | DEFAULT["checks"] | dict.fromkeys(OFF, False)
 FENCE = re.compile(r"^( *)```.*?^\1```|`[^`\n]+`|<[^>]+>|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
-RUST = re.compile(r'"(?:[^"\\]|\\.)*"|//[/!]?(.*)')
+MARKER = re.compile(r'^[ \t]*(//[/!]?|/?\*+|#:?|""")', re.MULTILINE)
+#: Suffixes of files with comments in the syntax of a language.
+CODE = {".rs", ".py", ".pyi", ".js", ".css", ".toml"}
 
 
-def blank(text: str) -> str:
+def blank(match: re.Match[str] | str) -> str:
     """Replaces everything except line breaks with spaces, so that positions stay the same."""
-    return re.sub(r"[^\n]", " ", text)
+    return re.sub(r"[^\n]", " ", match if isinstance(match, str) else match[0])
 
 
-def without_code(text: str) -> str:
-    """Blanks the code, tags and links in Markdown."""
-    return FENCE.sub(lambda match: blank(match[0]), text)
-
-
-def rust_comments(text: str) -> str:
-    """Returns the comments of a Rust file, at their original positions."""
-    kept = list(blank(text))
-    for match in RUST.finditer(text):
-        if match[1] is not None:
-            kept[match.start(1) : match.end(1)] = match[1]
-    return without_code("".join(kept))
-
-
-def python_comments(text: str) -> str:
-    """Returns the comments and docstrings of a Python file, at their original positions."""
-    lines, kept = text.splitlines(keepends=True), list(blank(text))
-    starts, before = [0], tokenize.NEWLINE
-    for line in lines:
-        starts.append(starts[-1] + len(line))
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        is_docstring = token.type == tokenize.STRING and before in {tokenize.NEWLINE, tokenize.INDENT, tokenize.NL}
-        if is_docstring or token.type == tokenize.COMMENT:
-            (first, begin), (last, end) = token.start, token.end
-            span = slice(starts[first - 1] + begin, starts[last - 1] + end)
-            kept[span] = re.sub(r'^#:?|"""', lambda match: blank(match[0]), text[span])
-        before = token.type
-    return without_code("".join(kept))
-
-
-def hash_comments(text: str) -> str:
-    """Returns the comments of a shell or TOML file, at their original positions."""
-    return re.sub(r"^([^#\n]*)(#?)", lambda match: " " * len(match[0]), text, flags=re.MULTILINE)
-
-
-TEXT_OF: dict[str, Callable[[str], str]] = {
-    ".md": without_code,
-    ".rs": rust_comments,
-    ".py": python_comments,
-    ".pyi": python_comments,
-    ".toml": hash_comments,
-}
+def comments(name: str, text: str) -> str:
+    """Returns the comments and docstrings of a source file, at their original positions."""
+    parts = list[str]()
+    for _, token, value in get_lexer_for_filename(name).get_tokens_unprocessed(text):
+        is_comment = token in Token.Comment or token in Token.String.Doc
+        parts.append(MARKER.sub(blank, value) if is_comment else blank(value))
+    return "".join(parts)
 
 
 def faults(path: Path) -> Iterator[str]:
     """Yields one line for each fault in a file."""
-    text = TEXT_OF[path.suffix](path.read_text("utf-8"))
-    file = LintFile(str(path), text)
+    text, is_document = path.read_text("utf-8"), path.suffix == ".md"
+    # Lexers are slow, and most files contain no listed phrase at all.
+    if not is_document and not ANY.search(MARKER.sub(blank, text)):
+        return
+    file = LintFile(str(path), FENCE.sub(blank, text if is_document else comments(path.name, text)))
     # In comments, only the project's own list is checked, because many standard checks report false positives there.
-    checks = ALL_CHECKS if path.suffix == ".md" else OUR_CHECKS
+    checks = ALL_CHECKS if is_document else OUR_CHECKS
     for fault in file.lint({**DEFAULT, "checks": checks}):
         found = " ".join(file.content[slice(*fault.check_result.span)].split())
         yield f"{path}:{fault.pos[0]}: {found!r}: {fault.check_result.message}"
 
 
 def main() -> None:
-    """Checks all files of the repository."""
+    """Checks the repository's documents, except the changelog, and the comments of its code."""
     CheckRegistry().register_many((*STANDARD, *OURS))
     listed = subprocess.run(["git", "ls-files"], check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()
     paths = [Path(name) for name in listed if not name.startswith(("fuzz/corpus/", "CHANGELOG"))]
-    found = [fault for path in paths if path.suffix in TEXT_OF for fault in faults(path)]
+    found = [fault for path in paths if path.suffix in {".md", *CODE} and path.exists() for fault in faults(path)]
     sys.exit("\n".join(found) or None)
 
 

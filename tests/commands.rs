@@ -103,9 +103,7 @@ pub fn agent(arguments: &str) -> Ended {
     ended
 }
 
-/// words | words` of a table, after replacing `TINY` by [`TINY`]. => Checks every line `flags => words | words` of a
-/// table, in which the word `TINY` stands for the flags in [`TINY`]. => words | words` of a table, after replacing
-/// `TINY` by [`TINY`].
+/// Checks every line `flags => words | words` of a table. In the flags, `TINY` stands for [`TINY`].
 pub fn check_table(program: &str, table: &str) {
     for line in table.trim().lines() {
         let (flags, words) = line.split_once(" => ").expect("flags and words");

@@ -113,16 +113,17 @@ fn kill(n_loops: u64, n_kills: usize, n_kinds: u32) {
     left.retain(|path| is_of(path, &killed));
     left.extend(instances.iter().flat_map(service_files));
     // A process that is killed while it creates a service leaves an empty file, which does not contain the instance's
-    // name.
+    // name. The file of a living process is empty only for a moment.
+    let mut empty = all_under(SHARED_MEMORY.as_ref());
     let is_empty = |path: &PathBuf| {
         path.extension() == Some("service".as_ref())
             && path.metadata().is_ok_and(|it| it.len() == 0)
     };
-    left.extend(
-        all_under(SHARED_MEMORY.as_ref())
-            .into_iter()
-            .filter(is_empty),
-    );
+    eventually(Duration::from_secs(10), || {
+        empty.retain(is_empty);
+        empty.is_empty()
+    });
+    left.extend(empty);
     assert_eq!(left, Vec::<PathBuf>::new());
 }
 

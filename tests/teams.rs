@@ -337,9 +337,9 @@ fn agents_disturbed_at_random_change_nothing_for_the_others() {
     }
 }
 
-/// Flies four robots in a world with many fires, with one agent for each range of robots in `parts`. Returns the paths
-/// and the reward.
-fn flown_by(parts: &[Range<u32>], company: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
+/// Flies four robots in a world with many fires, with one agent for each range of robots in `parts`. `cooperation` is
+/// `--team`, `--share` or nothing. Returns the paths and the reward.
+fn flown_by(parts: &[Range<u32>], cooperation: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
     const N_STEPS: usize = 40;
     let server = Server::start(
         "--model wildfire-small --height 16 --width 14 --moves 8 --burn-in 300 --robots 4",
@@ -349,12 +349,12 @@ fn flown_by(parts: &[Range<u32>], company: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
     let _holder = server.acquire(0..4);
     let frames = Observer::frames(&server.instance).expect("the channel");
     let start = |robots: &Range<u32>| {
-        let robots = if company == "--team" {
+        let robots = if cooperation == "--team" {
             format!("--robots {}..{}", robots.start, robots.end)
         } else {
             format!("--robot {}", robots.start)
         };
-        let flags = format!("--steps {N_STEPS} --policy beam_exploit --takeover {company}");
+        let flags = format!("--steps {N_STEPS} --policy beam_exploit --takeover {cooperation}");
         Program::agent(&server.instance, &format!("{robots} {flags}"))
     };
     let agents: Vec<_> = parts.iter().map(start).collect();

@@ -192,7 +192,7 @@ fn a_number_that_is_not_finite_ends_training_by_name() {
     let resume = format!("{WORLDS} --steps 80 --resume");
     let words = format!(
         "update {next}: likelihood: expected finite numbers, got a NaN or infinite step; \
-         the training so far is saved in {}",
+         the last checkpoint, if there is one, is {}",
         checkpoint.display()
     );
     place.refuse("out", &resume, &words);

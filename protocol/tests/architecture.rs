@@ -1,4 +1,4 @@
-//! Checks that ARCHITECTURE.md names every room (folder of sources) and only existing files, that rooms use only rooms
+//! Checks that ARCHITECTURE.md names every layer (folder of sources) and only existing files, that layers use only layers
 //! below them, and that no files depend on each other in a cycle. The index of documents must be complete, and each
 //! test file must be a module of its test program.
 
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
-/// Folders of sources. Each folder in them that contains source files is a room.
+/// Folders of sources. Each folder in them that contains source files is a layer.
 const SOURCES: [&str; 15] = [
     "protocol/src",
     "protocol/messages/src",
@@ -38,11 +38,11 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// Returns the rooms in the order of the table.
-fn rooms() -> Vec<&'static str> {
+/// Returns the layers in the order of the table.
+fn layers() -> Vec<&'static str> {
     let rows = ARCHITECTURE.lines().filter(|line| line.starts_with("| `"));
-    let room = |row: &'static str| row.split('`').nth(1).expect("a room");
-    rows.map(room).collect()
+    let layer = |row: &'static str| row.split('`').nth(1).expect("a layer");
+    rows.map(layer).collect()
 }
 
 /// Returns the source files below a folder, relative to the root.
@@ -65,8 +65,8 @@ fn is_source(name: &str) -> bool {
     [".rs", ".py", ".js"].iter().any(|end| name.ends_with(end))
 }
 
-/// Returns the room of a source file: the topmost folder below the sources, or the sources themselves.
-fn room_of(path: &str) -> String {
+/// Returns the layer of a source file: the topmost folder below the sources, or the sources themselves.
+fn layer_of(path: &str) -> String {
     let of = |source: &&&str| path.starts_with(&format!("{source}/"));
     let source = SOURCES.iter().filter(of).max_by_key(|source| source.len());
     let source = source.expect("a folder of sources");
@@ -77,26 +77,26 @@ fn room_of(path: &str) -> String {
 }
 
 #[test]
-fn every_room_is_listed_and_every_room_and_file_named_exists() {
-    let rooms = rooms();
+fn every_layer_is_listed_and_every_layer_and_file_named_exists() {
+    let layers = layers();
     let files: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
-    let found: BTreeSet<String> = files.iter().map(|path| room_of(path)).collect();
-    // Folders that contain rooms and folders inside a room need no row in the table.
+    let found: BTreeSet<String> = files.iter().map(|path| layer_of(path)).collect();
+    // Folders that contain layers and folders inside a layer need no row in the table.
     let inner = [
         "agent/network/src/ops",
         "agent/network/src/dqn",
         "tests/src/fuzz",
     ];
-    let needs_line = |room: &&String| {
-        let is_inside = |other: &String| other.starts_with(&format!("{room}/"));
-        !found.iter().any(is_inside) && !inner.contains(&room.as_str())
+    let needs_line = |layer: &&String| {
+        let is_inside = |other: &String| other.starts_with(&format!("{layer}/"));
+        !found.iter().any(is_inside) && !inner.contains(&layer.as_str())
     };
-    for room in found.iter().filter(needs_line) {
-        assert!(rooms.contains(&room.as_str()), "{room} is not listed");
+    for layer in found.iter().filter(needs_line) {
+        assert!(layers.contains(&layer.as_str()), "{layer} is not listed");
     }
     assert!(files.len() > 80, "{files:?}");
-    for room in rooms {
-        assert!(root().join(room).exists(), "{room} does not exist");
+    for layer in layers {
+        assert!(root().join(layer).exists(), "{layer} does not exist");
     }
     let quoted = ARCHITECTURE.split('`').skip(1).step_by(2);
     for name in quoted.filter(|name| is_source(name)) {
@@ -156,12 +156,12 @@ fn the_readme_shows_the_example_of_the_crate() {
 }
 
 #[test]
-fn rooms_use_only_those_below_them() {
-    let rooms = rooms();
+fn layers_use_only_those_below_them() {
+    let layers = layers();
     for name in ["agent", "agent/learning", "env-server", "env-server/sim"] {
         let place = |module: &[String]| {
-            let room = format!("{name}/src/{}", module.first()?);
-            rooms.iter().position(|name| *name == room)
+            let layer = format!("{name}/src/{}", module.first()?);
+            layers.iter().position(|name| *name == layer)
         };
         for (file, used) in graph_of(name) {
             let Some(own) = place(&file) else { continue };

@@ -199,7 +199,7 @@ impl Arena {
         self.client.step(robots, &paths)?;
         let states = self.states(worlds, seeds, step)?;
         let states = states.into_iter().collect::<Option<_>>();
-        states.context("scouts need hidden states: start the server with --publish-truth")
+        states.context("scouts need the truth channel: start the server with --publish-truth")
     }
 
     /// Returns what a robot that sees every cell would have observed in a seed's world at `step`, which is at least 1.

@@ -249,8 +249,9 @@ impl Match<'_> {
             return Ok(Cow::Borrowed(self.prior));
         }
         let states = seen.truth.as_ref();
-        let states =
-            states.context("expected hidden states: start the server with --publish-truth")?;
+        let states = states.context(
+            "the first belief needs the truth channel: start the server with --publish-truth",
+        )?;
         let certain = Belief::from_states(states, arena.known_model().n_states())?;
         Ok(Cow::Owned(certain))
     }

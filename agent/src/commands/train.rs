@@ -64,7 +64,7 @@ pub struct TrainCommand {
     /// Estimator whose belief decisions are learned on [default: learned_filter; with --resume: the checkpoint's]
     #[arg(long, value_name = "NAME", value_parser = beliefs::of_options)]
     estimator: Option<&'static BeliefKind>,
-    /// Checkpoint of the --estimator from an earlier training; without it, the estimator is trained first. With
+    /// Checkpoint of the --estimator from an earlier training; without it, a learned estimator is trained first. With
     /// --learner neural: a filter whose belief the network corrects
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
@@ -151,8 +151,10 @@ impl TrainCommand {
             .worlds
             .unwrap_or(if kind.is_single { 1 } else { N_WORLDS });
         let last = self.world.checked_add(n_worlds);
-        let last =
-            last.context("--world: expected a world that a server can have, got a larger number")?;
+        let last = last.with_context(|| {
+            let world = self.world;
+            format!("--world: expected a world that a server can have, got {world}")
+        })?;
         let steps = (kind.steps)(&config);
         let device = self.device.open()?;
         let learned = self.learned(kind, &config, &device)?;

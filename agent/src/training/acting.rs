@@ -17,7 +17,7 @@ pub struct Acting<'a> {
     robots: Range<u32>,
     /// Number of robots per world.
     team: u32,
-    /// Time that the last plan took to compute.
+    /// Time to compute the last plans of all robots together.
     pub planning: Duration,
 }
 

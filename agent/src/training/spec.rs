@@ -148,13 +148,13 @@ impl TrainingSpec {
         Ok(first..end)
     }
 
-    /// Returns the error for a learner that cannot continue. The learner's state is saved when the training ends.
+    /// Returns the error for a learner that cannot continue. It names the checkpoint that the training writes.
     pub(super) fn stopped(&self, problem: anyhow::Error, learner: &dyn Learner) -> anyhow::Error {
         if problem.is::<ConnectionError>() {
             return problem;
         }
         anyhow!(
-            "after {} world steps: {problem:#}; the training so far is saved in {}",
+            "after {} world steps: {problem:#}; the last checkpoint, if there is one, is {}",
             learner.world_steps(),
             self.out.join(CHECKPOINT).display()
         )

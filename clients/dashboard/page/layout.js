@@ -14,7 +14,7 @@ const LANE = 9;
 const LANE_GAP = 1.2;
 const CAPTION_WIDTH = 8;
 const NOTE = 5;
-// Minimum panel width in rem. If the panels do not fit at this width, they keep a readable size and the page scrolls.
+// Minimum panel width in rem. If the panels do not fit at this width, they keep a readable size and their field scrolls.
 const MIN_WIDTH = 4;
 // Number of panels before the inspector in a regular layout.
 const OBSERVED = 3;
@@ -22,7 +22,7 @@ const OBSERVED = 3;
 /**
  * Returns the best layout of panels within `area`: columns, the panels' size in CSS pixels, the inspector's span.
  * `places` has the numbers of panels, of inspector lines and of columns in a regular layout. If `isBare` is set, a note
- * replaces the beliefs. If the area's height is Infinity, the page scrolls, and the layout has `forced` columns.
+ * replaces the beliefs. If the area's height is Infinity, the page or the field scrolls, and the layout has `forced` columns.
  */
 export function fit({ area, shape, places, forced, gap, caption, ratio, rem }) {
   const minimum = CAPTION_WIDTH * rem + gap;

@@ -261,7 +261,7 @@ impl Arrays {
     }
 
     /// Adds time series over all kept steps, divided into `n_bins` bins. Each bin contains means over its steps, and
-    /// its last objective. Returns the names of the objectives.
+    /// its last objective. Returns the names of the objectives, and the range of the bins.
     fn add_series<'a>(
         &mut self,
         strip: &'a Strip,

@@ -66,5 +66,5 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
     let seconds = text.parse::<f64>().ok();
     seconds
         .and_then(|seconds| Duration::try_from_secs_f64(seconds).ok())
-        .ok_or_else(|| "expected seconds, at least 0".into())
+        .ok_or_else(|| "expected a number of seconds, at least 0".into())
 }

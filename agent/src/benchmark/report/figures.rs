@@ -185,8 +185,8 @@ fn chart(group: &Group<'_>) -> (&'static str, Color) {
     chart_of(belief)
 }
 
-/// Draws the total reward of a world's robots against the number of robots, with one curve per kind of team. Draws
-/// nothing if all runs have the same number of robots.
+/// Draws the total reward of a world's robots against the number of robots, with one curve per policy and kind of
+/// team. Draws nothing if all runs have the same number of robots.
 pub fn draw_teams(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
     if runs.iter().all(|run| run.robots == runs[0].robots) {
         return Ok(());

@@ -27,7 +27,8 @@ pub struct PolicyRun {
     /// Mean Brier score of the belief; `None` without a belief.
     pub brier: Option<f64>,
     pub moves: usize,
-    /// Number of robots in the world. Rewards, cells and planning times are sums over all robots.
+    /// Number of robots in the world. Rewards and cells are the team's: a cell that several robots visit in a step counts
+    /// once. Planning times are summed over the world's agents.
     #[serde(default = "one")]
     pub robots: u32,
     #[serde(default = "alone")]
