@@ -80,8 +80,9 @@ fn layer_of(path: &str) -> String {
 fn every_layer_is_listed_and_every_layer_and_file_named_exists() {
     let layers = layers();
     let files: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
-    let found: BTreeSet<String> = files.iter().map(|path| layer_of(path)).collect();
-    // Folders that contain layers and folders inside a layer need no row in the table.
+    // Folders that hold only a module's unit tests, contain layers or lie inside a layer need no row in the table.
+    let sources = files.iter().filter(|path| !path.ends_with("/tests.rs"));
+    let found: BTreeSet<String> = sources.map(|path| layer_of(path)).collect();
     let inner = [
         "agent/network/src/ops",
         "agent/network/src/dqn",
