@@ -1,7 +1,7 @@
 //! Runs every decoder on the files of its corpus and on damaged copies of these files. This is a separate test program,
 //! because it measures the memory of its process.
 //!
-//! Each decoder gets 40 * `PROPTEST_CASES` copies, by default 10,240. `fuzz/` has coverage-guided fuzzers of the same
+//! Each decoder gets 10 * `PROPTEST_CASES` copies, by default 2,560. `fuzz/` has coverage-guided fuzzers of the same
 //! decoders.
 
 use proptest::collection::vec;
@@ -111,7 +111,7 @@ fn attack(target: &Target) {
         decode(target, file).expect(name);
     }
     let config = Config {
-        cases: 40 * Config::default().cases,
+        cases: 10 * Config::default().cases,
         failure_persistence: Some(Box::new(FileFailurePersistence::Off)),
         ..Config::default()
     };

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources. Each folder in them that contains source files is a layer.
-const SOURCES: [&str; 15] = [
+const SOURCES: [&str; 16] = [
     "protocol/src",
     "protocol/messages/src",
     "protocol/model/src",
@@ -17,6 +17,7 @@ const SOURCES: [&str; 15] = [
     "agent/src",
     "agent/belief/src",
     "agent/figures/src",
+    "agent/gradient/src",
     "agent/learning/src",
     "agent/network/src",
     "clients/dashboard/src",
@@ -177,7 +178,10 @@ fn layers_use_only_those_below_them() {
 #[test]
 fn pure_crates_need_no_channels_and_no_flags() {
     let pure = ["protocol/model", "protocol/messages", "env-server/sim"];
-    for name in pure.into_iter().chain(["agent/belief", "agent/learning"]) {
+    for name in pure
+        .into_iter()
+        .chain(["agent/belief", "agent/gradient", "agent/learning"])
+    {
         let manifest = std::fs::read_to_string(root().join(name).join("Cargo.toml"));
         let manifest = manifest.expect("a manifest");
         for other in ["iceoryx2", "clap", "tokio", "emberwatch-protocol"] {

@@ -1,7 +1,7 @@
 //! Maximum-likelihood estimation for a [`BayesFilter`](emberwatch_belief::estimation::BayesFilter) without a bias:
 //! [`Optimiser`] learns the weights `w`, the observation matrix `O` and the first belief. Read `parameters` in
-//! `emberwatch_belief` first, then `recursion` for one pass through a window of frames and its derivatives, then
-//! `optimiser`.
+//! `emberwatch_belief` first, then [`Recursion`](emberwatch_gradient::Recursion) for one pass through a window of frames
+//! and its derivatives, then `optimiser`.
 //!
 //! The data determine neither the scale of `w` (eq. 3 divides it out) nor the order of the states, and the meaning of
 //! the states only in part. Parameter sets that predict all observations equally well are indistinguishable. For
@@ -10,12 +10,7 @@
 //! prior under which the observation of the state with the highest reward is almost certain.
 
 mod adam;
-mod convolution;
-mod layout;
-mod operator;
 mod optimiser;
-mod recursion;
 
 pub use adam::Adam;
 pub use optimiser::{Optimiser, Update};
-pub use recursion::Recursion;

@@ -8,15 +8,10 @@
 use crate::checkpoint::{check, check_counts, check_numbers, wrong};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_gradient::Sighting;
 use emberwatch_model::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Sighting {
-    pub cell: u32,
-    pub value: u8,
-}
 
 /// Consecutive frames of one track, at least one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -8,10 +8,10 @@
 use crate::checkpoint::{check, check_counts, check_numbers};
 use crate::config::LearningConfig;
 use crate::gradient::adam::Adam;
-use crate::gradient::recursion::{Outcome, Recursion};
 use crate::replay::{Block, BlockReplay};
 use anyhow::{Result, anyhow};
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
+use emberwatch_gradient::{Outcome, Recursion};
 use emberwatch_model::Shape;
 use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;

@@ -3,7 +3,7 @@
 //! [`emberwatch_model::Transition`] also computes the forward pass. It is fast for sparse or repeated weights, which
 //! learned kernels lack, and it has no gradient.
 
-use crate::gradient::layout::{LANES, Layout};
+use crate::layout::{LANES, Layout};
 use pulp::{Simd, bytemuck};
 use std::ops::Range;
 
@@ -15,7 +15,7 @@ const WIDE: usize = 4;
 
 /// A convolution from planes to planes: `to[m] = base[m] + sum_n sum_a w[m, n, a] from[n, . + a]`.
 #[derive(Debug, Clone)]
-pub(super) struct Convolution {
+pub(crate) struct Convolution {
     layout: Layout,
     n_from: usize,
     /// The weights `w[to, from, row, col]`.
@@ -24,7 +24,7 @@ pub(super) struct Convolution {
 
 /// The initial value of the sums.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Base<'a> {
+pub(crate) enum Base<'a> {
     Zero,
     /// One value per plane.
     Biases(&'a [f32]),
@@ -33,7 +33,7 @@ pub(super) enum Base<'a> {
 }
 
 impl Convolution {
-    pub(super) fn new(layout: Layout, n_from: usize, weights: Vec<f32>) -> Self {
+    pub(crate) fn new(layout: Layout, n_from: usize, weights: Vec<f32>) -> Self {
         Self {
             layout,
             n_from,
@@ -41,13 +41,13 @@ impl Convolution {
         }
     }
 
-    pub(super) fn n_to(&self) -> usize {
+    pub(crate) fn n_to(&self) -> usize {
         self.weights.len() / (self.n_from * self.layout.n_taps())
     }
 
     /// Returns the convolution that takes derivatives from `to` back to `from`, with the weights
     /// `w[from, to, KH - 1 - row, KW - 1 - col]`.
-    pub(super) fn turned(&self) -> Self {
+    pub(crate) fn turned(&self) -> Self {
         let (n_from, n_taps) = (self.n_from, self.layout.n_taps());
         let mut turned = Vec::with_capacity(self.weights.len());
         for from in 0..n_from {
@@ -61,7 +61,7 @@ impl Convolution {
 
     /// Computes one row of the grid.
     #[inline(always)]
-    pub(super) fn row<S: Simd>(
+    pub(crate) fn row<S: Simd>(
         &self,
         simd: S,
         from: &[f32],
@@ -156,7 +156,7 @@ impl Convolution {
     /// Adds the derivatives with respect to the weights to `gradient`. `h` contains the derivatives with respect to the
     /// result, which are zero outside `region`.
     #[inline(always)]
-    pub(super) fn add_weight_gradient<S: Simd>(
+    pub(crate) fn add_weight_gradient<S: Simd>(
         &self,
         simd: S,
         from: &[f32],
@@ -247,20 +247,20 @@ impl Convolution {
 
 /// The rows and columns within which a gradient can be non-zero. The columns form whole SIMD vectors.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Region {
-    pub(super) rows: Range<usize>,
-    pub(super) cols: Range<usize>,
+pub(crate) struct Region {
+    pub(crate) rows: Range<usize>,
+    pub(crate) cols: Range<usize>,
 }
 
 impl Region {
-    pub(super) fn add(&mut self, row: usize, col: usize) {
+    pub(crate) fn add(&mut self, row: usize, col: usize) {
         self.rows = widened(&self.rows, row..row + 1);
         let col = col / LANES * LANES;
         self.cols = widened(&self.cols, col..col + LANES);
     }
 
     /// Returns the region that the kernel reaches from this region.
-    pub(super) fn reached(&self, layout: &Layout) -> Self {
+    pub(crate) fn reached(&self, layout: &Layout) -> Self {
         if self.rows.is_empty() {
             return Self::default();
         }
@@ -277,7 +277,7 @@ impl Region {
 
     /// Returns the index of each of the region's SIMD vectors in a row.
     #[inline(always)]
-    pub(super) fn places<S: Simd>(
+    pub(crate) fn places<S: Simd>(
         &self,
         layout: &Layout,
         row: usize,
@@ -296,12 +296,12 @@ fn widened(range: &Range<usize>, other: Range<usize>) -> Range<usize> {
 }
 
 #[inline(always)]
-pub(super) fn load<S: Simd>(planes: &[f32], at: usize) -> S::f32s {
+pub(crate) fn load<S: Simd>(planes: &[f32], at: usize) -> S::f32s {
     S::as_simd_f32s(&planes[at..][..S::F32_LANES]).0[0]
 }
 
 #[inline(always)]
-pub(super) fn store<S: Simd>(numbers: S::f32s, planes: &mut [f32], at: usize) {
+pub(crate) fn store<S: Simd>(numbers: S::f32s, planes: &mut [f32], at: usize) {
     S::as_mut_simd_f32s(&mut planes[at..][..S::F32_LANES]).0[0] = numbers;
 }
 

@@ -5,20 +5,31 @@
 //! pass runs the same steps in reverse, and stops at the window's first predictor (truncated backpropagation).
 //! Gradients are zero far from the cells that later frames visit, so only the remaining region is computed.
 
-use crate::gradient::convolution::Region;
-use crate::gradient::layout::Layout;
-use crate::gradient::operator::Operator;
-use crate::replay::Sighting;
+use crate::convolution::Region;
+use crate::layout::Layout;
+use crate::operator::Operator;
 use emberwatch_belief::estimation::parameters::Tables;
 use emberwatch_model::Shape;
 use pulp::{Arch, Simd, WithSimd};
+use serde::{Deserialize, Serialize};
 
+/// The observation of one cell in a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Sighting {
+    /// Index of the cell in the grid, row by row.
+    pub cell: u32,
+    /// Index of the observation, below the model's number of observations.
+    pub value: u8,
+}
+
+/// The result of one pass through a window.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
     /// Derivatives of `-log_likelihood` with respect to the kernel, the likelihood and the first belief.
     pub gradient: [Vec<f64>; 3],
     /// Sum of `ln P(y)` over visited cells.
     pub log_likelihood: f64,
+    /// Number of visited cells, counted once per frame.
     pub n_seen: usize,
 }
 

@@ -4,28 +4,28 @@
 use emberwatch_model::Shape;
 
 /// Number of cells in the widest SIMD vector, which is a multiple of every processor's vector length.
-pub(super) const LANES: usize = 16;
+pub(crate) const LANES: usize = 16;
 
 /// The layout of planes whose margins are half a kernel wide. Rows are padded to a multiple of [`LANES`], plus
 /// [`LANES`] further columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Layout {
-    pub(super) shape: Shape,
-    pub(super) n_states: usize,
-    pub(super) kernel_height: usize,
-    pub(super) kernel_width: usize,
+pub(crate) struct Layout {
+    pub(crate) shape: Shape,
+    pub(crate) n_states: usize,
+    pub(crate) kernel_height: usize,
+    pub(crate) kernel_width: usize,
     /// Rows of margin above the grid.
-    pub(super) above: usize,
+    pub(crate) above: usize,
     /// Columns of margin to the left of the grid.
-    pub(super) left: usize,
+    pub(crate) left: usize,
     /// Offset from one row to the next.
-    pub(super) stride: usize,
+    pub(crate) stride: usize,
     /// Offset from one state to the next.
-    pub(super) plane: usize,
+    pub(crate) plane: usize,
 }
 
 impl Layout {
-    pub(super) fn new(shape: Shape, n_states: usize, kernel: (usize, usize)) -> Self {
+    pub(crate) fn new(shape: Shape, n_states: usize, kernel: (usize, usize)) -> Self {
         let (kernel_height, kernel_width) = kernel;
         // Kernels are at most 15 wide (`MAX_KERNEL_SIDE`), so that one further vector is enough.
         let stride = shape.width().next_multiple_of(LANES) + LANES;
@@ -42,38 +42,38 @@ impl Layout {
     }
 
     /// Returns the number of weights of the kernel between two states.
-    pub(super) fn n_taps(&self) -> usize {
+    pub(crate) fn n_taps(&self) -> usize {
         self.kernel_height * self.kernel_width
     }
 
     /// Allocates planes of zeros, one per state.
-    pub(super) fn planes(&self) -> Vec<f32> {
+    pub(crate) fn planes(&self) -> Vec<f32> {
         vec![0.0; self.n_states * self.plane]
     }
 
     /// Returns the number of computed columns, a multiple of the vector length.
-    pub(super) fn columns(&self) -> usize {
+    pub(crate) fn columns(&self) -> usize {
         self.shape.width().next_multiple_of(LANES)
     }
 
     /// Returns the index of a row's first cell in the first state's plane.
-    pub(super) fn row(&self, row: usize) -> usize {
+    pub(crate) fn row(&self, row: usize) -> usize {
         (row + self.above) * self.stride + self.left
     }
 
     /// Returns the index of a cell in the first state's plane.
-    pub(super) fn place(&self, cell: usize) -> usize {
+    pub(crate) fn place(&self, cell: usize) -> usize {
         self.row(cell / self.shape.width()) + cell % self.shape.width()
     }
 
     /// Returns 1 for each column of the grid, and 0 for each further computed column.
-    pub(super) fn mask(&self) -> Vec<f32> {
+    pub(crate) fn mask(&self) -> Vec<f32> {
         let on_grid = |col| f32::from(u8::from(col < self.shape.width()));
         (0..self.columns()).map(on_grid).collect()
     }
 
     /// Copies a belief `[S, H, W]` into the planes, inside the margins.
-    pub(super) fn load(&self, from: &[f32], to: &mut [f32]) {
+    pub(crate) fn load(&self, from: &[f32], to: &mut [f32]) {
         let states = from.chunks_exact(self.shape.n_cells());
         for (cells, plane) in states.zip(to.chunks_exact_mut(self.plane)) {
             for (row, cells) in cells.chunks_exact(self.shape.width()).enumerate() {
@@ -83,7 +83,7 @@ impl Layout {
     }
 
     /// Copies the planes into a belief `[S, H, W]`, the reverse of [`Self::load`].
-    pub(super) fn unload(&self, from: &[f32], to: &mut [f32]) {
+    pub(crate) fn unload(&self, from: &[f32], to: &mut [f32]) {
         let states = to.chunks_exact_mut(self.shape.n_cells());
         for (cells, plane) in states.zip(from.chunks_exact(self.plane)) {
             for (row, cells) in cells.chunks_exact_mut(self.shape.width()).enumerate() {

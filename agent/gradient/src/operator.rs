@@ -10,16 +10,16 @@
 //! `d[o] = sum_m g[m] q[o, m]`: `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has the additional term
 //! `d[o]`.
 
-use crate::gradient::convolution::{Base, Convolution, Region, load, store};
-use crate::gradient::layout::Layout;
+use crate::convolution::{Base, Convolution, Region, load, store};
+use crate::layout::Layout;
 use pulp::Simd;
 use std::ops::Range;
 
 /// The operator for a grid. Weights are `w[to, from, row, col]`, or `w[own, to, from, row, col]` with own-state
 /// kernels.
 #[derive(Debug, Clone)]
-pub(super) struct Operator {
-    pub(super) layout: Layout,
+pub(crate) struct Operator {
+    pub(crate) layout: Layout,
     forward: Convolution,
     backward: Convolution,
     /// The centre weights of own-state kernels, `[own, to]`.
@@ -28,7 +28,7 @@ pub(super) struct Operator {
 }
 
 impl Operator {
-    pub(super) fn new(layout: Layout, n_own: usize, weights: &[f32]) -> Self {
+    pub(crate) fn new(layout: Layout, n_own: usize, weights: &[f32]) -> Self {
         let mut weights = weights.to_vec();
         let centres = (n_own > 1).then(|| take_centres(&layout, &mut weights));
         let forward = Convolution::new(layout, layout.n_states, weights);
@@ -42,14 +42,14 @@ impl Operator {
     }
 
     /// Allocates planes for `v` and `h`.
-    pub(super) fn weighed_planes(&self) -> Vec<f32> {
+    pub(crate) fn weighed_planes(&self) -> Vec<f32> {
         vec![0.0; self.forward.n_to() * self.layout.plane]
     }
 
     /// Computes `u = Phi_w(p)`. Without own-state kernels, `factors` (one plane) receives `1 / sum_m v`, which is 0
     /// outside of the grid. With own-state kernels, `v` is a scratch buffer.
     #[inline(always)]
-    pub(super) fn forward<S: Simd>(
+    pub(crate) fn forward<S: Simd>(
         &self,
         simd: S,
         p: &[f32],
@@ -73,7 +73,7 @@ impl Operator {
 
     /// Computes `h` from `g` in a region. With own-state kernels, it replaces `g` with `d` and overwrites `u`.
     #[inline(always)]
-    pub(super) fn backward_normalise<S: Simd>(
+    pub(crate) fn backward_normalise<S: Simd>(
         &self,
         simd: S,
         p: &[f32],
@@ -100,7 +100,7 @@ impl Operator {
 
     /// Adds `dL/dw` for a region of `h` to `gradient`. Call [`Self::end_gradient`] after the last region.
     #[inline(always)]
-    pub(super) fn add_weight_gradient<S: Simd>(
+    pub(crate) fn add_weight_gradient<S: Simd>(
         &self,
         simd: S,
         p: &[f32],
@@ -115,7 +115,7 @@ impl Operator {
     /// Completes the gradient of own-state kernels. The derivative with respect to a centre weight is the sum of `h`
     /// over all cells. As beliefs sum to one, this equals the sum of the derivatives with respect to the centre weights
     /// of all states.
-    pub(super) fn end_gradient(&self, gradient: &mut [f64]) {
+    pub(crate) fn end_gradient(&self, gradient: &mut [f64]) {
         if self.centres.is_some() {
             end_gradient(&self.layout, gradient);
         }
@@ -123,7 +123,7 @@ impl Operator {
 
     /// Computes `dL/dp` in some rows, from `h` and, with own-state kernels, from `d` in `g`.
     #[inline(always)]
-    pub(super) fn backward_correlate<S: Simd>(
+    pub(crate) fn backward_correlate<S: Simd>(
         &self,
         simd: S,
         h: &[f32],
