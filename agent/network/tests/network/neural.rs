@@ -199,42 +199,46 @@ fn worlds_are_predicted_together_as_each_alone() {
     assert!(ours.predict_all(&[]).expect("none").is_empty());
 }
 
-#[test]
-fn it_learns_alone_and_corrects_the_distributions_of_another() {
-    let base = base();
-    for (lessons, base, at_first, n_updates) in [
-        (lessons(60), None, Some(3_f64.ln()), 150),
-        (with_bases(lessons(60)), Some(&base), None, 100),
-    ] {
-        let mut network = neural();
-        let last = &lessons[50..];
-        let loss = |network: &NeuralBelief| numbers(&network.loss(last).expect("a loss"))[0];
-        let belief = |network: &NeuralBelief| {
-            let belief = network.predict(&lessons[50].before, base);
-            belief.expect("a belief")
-        };
-        let seen = || last.iter().flat_map(|lesson| &lesson.frame);
-        let loss_at =
-            |&(cell, value): &(usize, u8)| -f64::from(base_of(cell)[usize::from(value)]).ln();
-        let of_base = seen().map(loss_at).sum::<f64>() / seen().count() as f64;
-        let difference = loss(&network) - at_first.unwrap_or(of_base);
-        assert!(difference.abs() < 1e-5, "at first {difference}");
-        if let Some(base) = base {
-            let differences = (&belief(&network) - base).mapv(f32::abs);
-            assert!(differences.fold(0.0, |worst: f32, d| worst.max(*d)) < 1e-5);
-        }
-        for update in 0..n_updates {
-            let batch = &lessons[update % 40..][..10];
-            network.update(5e-3, batch).expect("finite");
-        }
-        // Half of the cells always show 1, and the others show one of two values. The best loss of a network that
-        // ignores the step is `ln(2) / 2`.
-        assert!(loss(&network) < 0.4, "{}", loss(&network));
-        let belief = belief(&network);
-        assert!(belief.iter().all(|p| (1e-7..=1.0).contains(p)));
-        let sums = belief.sum_axis(Axis(0));
-        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-5));
+/// Trains on 50 lessons, and checks the loss of the last 10 before and after.
+fn check_learning(lessons: &[Lesson], base: Option<&Array3<f32>>, at_first: f64, n_updates: usize) {
+    let mut network = neural();
+    let last = &lessons[50..];
+    let loss = |network: &NeuralBelief| numbers(&network.loss(last).expect("a loss"))[0];
+    let belief = |network: &NeuralBelief| {
+        let belief = network.predict(&lessons[50].before, base);
+        belief.expect("a belief")
+    };
+    let difference = loss(&network) - at_first;
+    assert!(difference.abs() < 1e-5, "at first {difference}");
+    if let Some(base) = base {
+        let differences = (&belief(&network) - base).mapv(f32::abs);
+        assert!(differences.fold(0.0, |worst: f32, d| worst.max(*d)) < 1e-5);
     }
+    for update in 0..n_updates {
+        let batch = &lessons[update % 40..][..10];
+        network.update(5e-3, batch).expect("finite");
+    }
+    // Half of the cells always show 1, and the others show one of two values. The best loss of a network that ignores
+    // the step is `ln(2) / 2`.
+    assert!(loss(&network) < 0.4, "{}", loss(&network));
+    let belief = belief(&network);
+    assert!(belief.iter().all(|p| (1e-7..=1.0).contains(p)));
+    let sums = belief.sum_axis(Axis(0));
+    assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-5));
+}
+
+#[test]
+fn it_learns_alone() {
+    check_learning(&lessons(60), None, 3_f64.ln(), 150);
+}
+
+#[test]
+fn it_corrects_the_distributions_of_another() {
+    let lessons = with_bases(lessons(60));
+    let seen = || lessons[50..].iter().flat_map(|lesson| &lesson.frame);
+    let loss_at = |&(cell, value): &(usize, u8)| -f64::from(base_of(cell)[usize::from(value)]).ln();
+    let of_base = seen().map(loss_at).sum::<f64>() / seen().count() as f64;
+    check_learning(&lessons, Some(&base()), of_base, 100);
 }
 
 #[test]

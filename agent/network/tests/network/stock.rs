@@ -36,7 +36,7 @@ const CASE: Case = Case {
     grid: [64, 64],
     n_states: 3,
     n_observations: 3,
-    n_frames: 10,
+    n_frames: 6,
     one_in: 10,
     drops: true,
 };
@@ -133,7 +133,6 @@ fn predictions_agree(exact: &Model, model: &Model, window: &Window) {
 fn of_a_devices_operators() {
     let case = Case {
         grid: [32, 48],
-        n_frames: 12,
         one_in: 9,
         ..CASE
     };
@@ -150,7 +149,7 @@ fn on_paths_without_dropout() {
     let case = Case {
         drops: false,
         one_in: 100,
-        n_frames: 20,
+        n_frames: 10,
         ..CASE
     };
     check(case, &[Operators::Own]);
