@@ -260,7 +260,7 @@ def test_invalid_keywords_are_named_at_construction() -> None:
     with refuses(r"expected None or one of human, .*, got 'film'"):
         emberwatch.WildfireEnv(render_mode="film")
     with pytest.raises(NoServerError, match="emberwatch-server --instance nobody"):
-        make(instance="nobody", timeout=0.1)
+        make(instance="nobody", timeout=3)
 
 
 def test_an_unknown_keyword_is_named() -> None:
