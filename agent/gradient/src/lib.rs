@@ -2,8 +2,8 @@
 //! back, and returns the derivatives with respect to the filter's parameters, the
 //! [`Tables`](emberwatch_belief::estimation::parameters::Tables).
 //!
-//! This is a crate of its own because its loops are one large function for each instruction set: the rest of the agent
-//! compiles quickly without them.
+//! It is a separate crate, because its loops compile slowly, into one large function for each instruction set, and
+//! `emberwatch-learning` then needs no optimisation in tests.
 
 mod convolution;
 mod layout;

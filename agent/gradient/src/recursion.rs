@@ -25,9 +25,10 @@ pub struct Sighting {
 /// The result of one pass through a window.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
-    /// Derivatives of `-log_likelihood` with respect to the kernel, the likelihood and the first belief.
+    /// Derivatives of `-log_likelihood` with respect to the kernel, the likelihood and the first belief, each with as
+    /// many numbers as this table of [`Tables`] has.
     pub gradient: [Vec<f64>; 3],
-    /// Sum of `ln P(y)` over visited cells.
+    /// Sum of `ln P(y)` over visited cells, in nats.
     pub log_likelihood: f64,
     /// Number of visited cells, counted once per frame.
     pub n_seen: usize,
