@@ -1,7 +1,7 @@
 //! Tests with clients that send hostile content in valid message types. The server must survive, and the worlds of
 //! other clients must continue undisturbed.
 //!
-//! `cargo test -p tests -- --ignored` sends a million messages.
+//! `cargo test -p tests -- --ignored` sends a quarter of a million messages.
 
 use emberwatch_protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
 use emberwatch_protocol::client::Claim;
@@ -54,8 +54,8 @@ fn random_messages_change_nothing_for_others() {
 
 #[test]
 #[ignore = "takes minutes"]
-fn a_million_random_messages_change_nothing_for_others() {
-    attack(1_000_000);
+fn many_random_messages_change_nothing_for_others() {
+    attack(250_000);
 }
 
 #[test]

@@ -134,8 +134,8 @@ fn killed_programs_leave_nothing_in_the_way() {
 
 #[test]
 #[ignore = "takes minutes"]
-fn thousands_of_killed_programs_leave_nothing_in_the_way() {
-    kill(5, 600, 4);
+fn a_thousand_killed_programs_leave_nothing_in_the_way() {
+    kill(5, 200, 4);
 }
 
 #[test]

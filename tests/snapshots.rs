@@ -254,7 +254,7 @@ fn servers_killed_at_any_moment_come_back_to_a_step_that_was() {
     let path = |k: usize| Paths::new(k as u64).next(N_MOVES);
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let mut expected = vec![undisturbed.observe(0..1).expect("observe").remove(0)];
-    for _ in 0..200 {
+    for _ in 0..80 {
         let server = Server::start_on(&instance, &format!("{SMALL} {flags}"));
         let mut client = server.take_over(0..1);
         let mut seen = client.observe(0..1).expect("observe").remove(0);

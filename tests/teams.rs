@@ -307,7 +307,7 @@ fn agents_disturbed_at_random_change_nothing_for_the_others() {
     let mut lab = Lab::new("--lease-millis 86400000 --deadline-ms 100");
     let mut agents = lab.start_agents();
     let mut rng = ChaCha8Rng::seed_from_u64(0);
-    for _ in 0..150 {
+    for _ in 0..50 {
         let robot: u32 = rng.random_range(1..TEAM);
         let agent = &mut agents[robot as usize - 1];
         let is = move |mask: u64| mask >> robot & 1 == 1;

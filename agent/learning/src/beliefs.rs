@@ -79,6 +79,7 @@ mod tests {
             for other in others {
                 assert!(![other.name, other.label].contains(&kind.name), "{kind:?}");
                 assert_ne!(other.label, kind.label);
+                assert_ne!(other.about, kind.about);
             }
         }
     }

@@ -148,6 +148,7 @@ fn replace(settings: &mut Table, by: Table, section: &str) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::HashSet;
 
     #[test]
     fn settings_override_defaults_and_unknown_settings_fail() {
@@ -158,6 +159,18 @@ mod tests {
         assert_eq!(AgentConfig::from_toml(&written).expect("valid"), config);
         let error = AgentConfig::from_toml("[dqn]\ngama = 1").expect_err("no such setting");
         assert_eq!(error.to_string(), "dqn.gama: expected a known setting");
+    }
+
+    #[test]
+    fn planner_seeds_depend_on_the_world_and_on_the_agent() {
+        let seeds = [(0, 1), (0, 2), (7, 1), (7, 2), (1, 7)].map(|(seed, world)| {
+            let config = AgentConfig {
+                seed,
+                ..AgentConfig::default()
+            };
+            config.planner_seed(world)
+        });
+        assert_eq!(HashSet::from(seeds).len(), seeds.len());
     }
 
     #[test]

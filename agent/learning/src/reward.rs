@@ -111,5 +111,9 @@ mod tests {
             assert!((found - expected).abs() < 0.01, "{found} {expected}");
         }
         assert_eq!(estimate.target(), Some(1));
+        let mut estimate = RewardEstimate::new(3);
+        estimate.add(&[0.0, 2.0, 0.0], 6.0);
+        // The ridge term, 1, is added to the sum of squares, 4. States that were never met keep reward 0.
+        assert_eq!(estimate.of_states(), [0.0, 12.0 / 5.0, 0.0]);
     }
 }

@@ -81,6 +81,23 @@ fn missed_steps_equal_steps_with_empty_frames() {
 }
 
 #[test]
+fn an_agent_scores_its_prediction_before_the_frame_corrects_it() {
+    let mut agent = robot("beam_exploit", &CELLS[..1]);
+    agent.plan();
+    agent.agent.predict();
+    let seen = seen(1, &CELLS[..1]);
+    let frame = &seen.observation.frame;
+    let [before, after] = [(); 2].map(|()| {
+        let score = agent.agent.score(frame).expect("a filter predicts frames");
+        agent.agent.correct(frame, None).expect("possible");
+        score
+    });
+    assert_eq!(before.n_seen, frame.observed().count() as u64);
+    assert!(before.log_likelihood < after.log_likelihood);
+    assert!(after.log_likelihood < 0.0);
+}
+
+#[test]
 fn agents_together_act_as_each_agent_alone() {
     let new = || {
         vec![

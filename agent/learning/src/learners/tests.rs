@@ -226,12 +226,29 @@ fn neural(
 }
 
 #[test]
+fn a_learned_filter_resumes_bit_for_bit() {
+    let (dimensions, config) = (dimensions(false), config(BasisKind::Estimate));
+    let mut learner = FilterLearner::new(dimensions, worlds(), &config);
+    learner.attach(vec![observation(0)]).expect("possible");
+    let left = learn(&mut learner, 1..12);
+    let resumed = FilterLearner::resume(&left, dimensions, worlds(), &config);
+    let mut resumed = resumed.expect("its own");
+    let n_resumed = resumed.attach(vec![observation(11)]).expect("possible");
+    assert_eq!(n_resumed, 1);
+    let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 12..16));
+    assert!(contents[0] == contents[1]);
+}
+
+#[test]
 fn a_neural_belief_resumes_bit_for_bit() {
     let filter = learned_filter(false);
     for filter in [None, Some(&filter)] {
         let mut learner = neural(None, filter, worlds()).expect("new");
         learner.attach(vec![observation(0)]).expect("possible");
+        let bias = |contents: &Contents| contents.tensors["head.bias"].clone();
+        let before = bias(&learner.contents().expect("whole"));
         let left = learn(&mut learner, 1..12);
+        assert!(bias(&left) != before, "something was learned");
         let resumed = || neural(Some(&left), None, worlds()).expect("its own");
         let mut continued = resumed();
         let n_resumed = continued.attach(vec![observation(11)]).expect("possible");

@@ -1,4 +1,5 @@
 use super::*;
+use crate::learners::tests::learned_filter;
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_network::{Device, Lesson};
 
@@ -91,6 +92,25 @@ fn predictions_together_equal_predictions_alone() {
         alone.predict();
         assert!(together.belief() == alone.belief(), "{index}");
         assert!(*alone.belief() != before, "{index}");
+    }
+}
+
+#[test]
+fn equal_models_have_equal_targets_filters_and_parameters() {
+    let model = |seed, filter: Option<LearnedModel>, target| NeuralModel {
+        network: NeuralBelief::new(3, seed, &Device::Cpu).expect("a network"),
+        filter: filter.map(Box::new),
+        target,
+    };
+    let learned = || Some(learned_filter(false));
+    let first = model(1, learned(), 1);
+    assert_eq!(first, model(1, learned(), 1));
+    for other in [
+        model(1, learned(), 2),
+        model(1, None, 1),
+        model(2, learned(), 1),
+    ] {
+        assert_ne!(first, other);
     }
 }
 
