@@ -68,8 +68,9 @@ EXAMPLES = [
 def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
     command = [sys.executable, str(FOLDER / name)]
     command += arguments.replace("OUT", str(tmp_path)).split()
-    # Finds programs that pip installed next to Python.
-    env = os.environ | {"PATH": f"{os.environ['PATH']}:{Path(sys.executable).parent}"}
+    # Finds programs that pip installed next to Python. Ray would join the cluster of another example.
+    path = f"{os.environ['PATH']}:{Path(sys.executable).parent}"
+    env = os.environ | {"PATH": path, "RAY_ADDRESS": "local"}
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=900, cwd=tmp_path, env=env
     )

@@ -9,7 +9,7 @@ use crate::learned::Learned;
 use crate::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use crate::learners::filter::FilterLearner;
 use crate::learners::filter::fit::FilterFit;
-use crate::learners::network::{NetworkLearner, Progress};
+use crate::learners::network::{NetworkLearner, Progress, SavedNetwork};
 use crate::learners::neural::NeuralLearner;
 use crate::learners::{Learner, Learning, Saving, Worlds};
 use crate::rollout::{Actor, Seen};
@@ -158,7 +158,9 @@ fn decisions_resume_bit_for_bit() {
         let base = Base::new(kind, None, learned, worlds().shape()).expect("learned");
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
         learner.attach(vec![observation(0)]).expect("possible");
+        let first = learner.contents().expect("whole");
         let left = learn(&mut learner, 1..12);
+        assert!(left.tensors != first.tensors, "something was learned");
         let saved: SavedDecisions = left.state().expect("its state");
         let base = saved.base(&left, worlds().shape(), &Device::Cpu);
         let base = base.expect("whole").expect("a belief");
@@ -211,6 +213,26 @@ fn decisions_learn_from_every_step_of_an_episode() {
         let short = &got[got.len().saturating_sub(4)..];
         assert!(short.iter().all(|it| it.next == short[0].next));
     }
+}
+
+#[test]
+fn the_network_remembers_the_reward_of_each_decision() {
+    let mut config = config(BasisKind::Estimate);
+    config.dqn.learning.n_step = 1;
+    let progress = Progress::first(&worlds(), &config, &Device::Cpu);
+    let mut learner = NetworkLearner::new(progress.expect("a network"), worlds(), &config);
+    learner.attach(vec![observation(0)]).expect("possible");
+    for step in 1..5 {
+        learner.plan();
+        let mut seen = observation(step);
+        seen.robot.reward = step as f64;
+        learner.see(vec![Seen::new([seen])]).expect("possible");
+        learner.predict();
+    }
+    let saved = learner.contents().expect("whole").state();
+    let saved: SavedNetwork = saved.expect("its state");
+    let rewards: Vec<f32> = saved.dqn.transitions.iter().map(|it| it.reward).collect();
+    assert_eq!(rewards, [1.0, 2.0, 3.0, 4.0]);
 }
 
 /// A learner of a neural belief that makes one update per step.

@@ -239,7 +239,10 @@ mod tests {
             fit.see(4, &frame, Some(&belief), &learned);
             let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
             fit.earn(&belief, &visited, 0.3);
-            fit.learn().expect("finite");
+            for update in fit.learn().expect("finite") {
+                // The mean over cells. It starts at ln 2 at most, because there are two values.
+                assert!(update.loss < 1.1, "{update:?}");
+            }
         }
     }
 
@@ -269,6 +272,7 @@ mod tests {
     fn a_fit_resumes_exactly_unless_its_streams_differ() {
         let mut fit = fit();
         assert!(fit.n_updates() > 0);
+        assert_eq!(fit.world_steps, 7);
         let stored = contents(&fit);
         let mut same = resume(&stored, DIMENSIONS, &config()).expect("whole");
         assert!(same.has_track(4) && contents(&same) == stored);
