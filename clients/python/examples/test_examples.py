@@ -68,7 +68,7 @@ EXAMPLES = [
 def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
     command = [sys.executable, str(FOLDER / name)]
     command += arguments.replace("OUT", str(tmp_path)).split()
-    # Finds programs that pip installed next to Python. Ray would join the cluster of another example.
+    # Finds programs that pip installed next to Python. Ray must not join another example's cluster.
     path = f"{os.environ['PATH']}:{Path(sys.executable).parent}"
     env = os.environ | {"PATH": path, "RAY_ADDRESS": "local"}
     done = subprocess.run(
