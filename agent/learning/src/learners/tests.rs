@@ -12,7 +12,7 @@ use crate::learners::filter::fit::FilterFit;
 use crate::learners::network::{NetworkLearner, Progress, SavedNetwork};
 use crate::learners::neural::NeuralLearner;
 use crate::learners::{Learner, Learning, Saving, Worlds};
-use crate::rollout::{Actor, Seen};
+use crate::rollout::Seen;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::BasisKind;
@@ -20,7 +20,7 @@ use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Airspace, Frame, Model, Shape};
-use emberwatch_network::{Device, NeuralBelief};
+use emberwatch_network::{Device, DqnSettings, NeuralBelief, Transition};
 
 pub(crate) fn worlds() -> Worlds {
     Worlds {
@@ -174,65 +174,109 @@ fn decisions_resume_bit_for_bit() {
     }
 }
 
+/// Flies an episode in which the reward of a step is its number, and begins the next one.
+fn fly_episode(learner: &mut impl Learner, n_steps: u64, is_terminated: bool) -> Contents {
+    learner.attach(vec![observation(0)]).expect("possible");
+    for step in 1..=n_steps {
+        learner.plan();
+        let mut seen = observation(step);
+        seen.robot.reward = step as f64;
+        seen.world.truncated = u16::from(step == n_steps && !is_terminated);
+        seen.world.terminated = u16::from(step == n_steps && is_terminated);
+        learner.see(vec![Seen::new([seen])]).expect("possible");
+        learner.predict();
+    }
+    learner.begin(0, observation(0)).expect("possible");
+    learner.contents().expect("whole")
+}
+
+/// Lengths of episodes, and whether they are terminated. Others are truncated.
+const EPISODES: [(u64, bool); 5] = [(1, true), (3, false), (4, true), (6, false), (6, true)];
+
+/// Checks the transitions of `fly_episode`, which sum up the rewards of `n_step` steps.
+fn check_transitions(
+    got: &[Transition],
+    (n_steps, is_terminated): (u64, bool),
+    learning: &DqnSettings,
+    scale: f32,
+) {
+    let (gamma, n) = (learning.gamma, learning.n_step as u64);
+    assert_eq!((got.len() as u64, n), (n_steps, 4));
+    for (first, got) in (1..).zip(got) {
+        let last = n_steps.min(first + n - 1);
+        let rewards = (first..=last).rev().map(|step| step as f32 * scale);
+        let reward = rewards.fold(0.0, |sum, reward| reward + gamma * sum);
+        assert!((got.reward - reward).abs() < 1e-4 * reward, "{n_steps}");
+        let ends = last == n_steps && is_terminated;
+        let discount = gamma.powi((last + 1 - first) as i32);
+        let discount = if ends { 0.0 } else { discount };
+        assert!((got.discount - discount).abs() < 1e-6, "{n_steps}");
+    }
+    // The transitions of the last steps all lead to the same state.
+    let short = &got[got.len().saturating_sub(4)..];
+    assert!(short.iter().all(|it| it.next == short[0].next));
+}
+
 #[test]
 fn decisions_learn_from_every_step_of_an_episode() {
     let config = config(BasisKind::Estimate);
-    let decisions = &config.decisions;
-    let (gamma, n) = (decisions.learning.gamma, decisions.learning.n_step as u64);
-    assert_eq!(n, 4);
-    let scale = decisions.reward_scale / worlds().n_moves as f32;
-    for (n_steps, is_terminated) in [(1, true), (3, false), (4, true), (6, false), (6, true)] {
+    let scale = config.decisions.reward_scale / worlds().n_moves as f32;
+    for episode in EPISODES {
         let learner = DecisionsLearner::new(known_base(), None, worlds(), &config);
-        let mut learner = learner.expect("new");
-        learner.attach(vec![observation(0)]).expect("possible");
-        for step in 1..=n_steps {
-            learner.plan();
-            let mut seen = observation(step);
-            seen.robot.reward = step as f64;
-            seen.world.truncated = u16::from(step == n_steps && !is_terminated);
-            seen.world.terminated = u16::from(step == n_steps && is_terminated);
-            learner.see(vec![Seen::new([seen])]).expect("possible");
-            learner.predict();
-        }
-        learner.begin(0, observation(0)).expect("possible");
-        let contents = learner.contents().expect("whole");
-        let saved: SavedDecisions = contents.state().expect("its state");
-        let got = saved.dqn.transitions;
-        assert_eq!(got.len() as u64, n_steps);
-        for (first, got) in (1..).zip(&got) {
-            let last = n_steps.min(first + n - 1);
-            let rewards = (first..=last).rev().map(|step| step as f32 * scale);
-            let reward = rewards.fold(0.0, |sum, reward| reward + gamma * sum);
-            assert!((got.reward - reward).abs() < 1e-4 * reward, "{n_steps}");
-            let ends = last == n_steps && is_terminated;
-            let discount = gamma.powi((last + 1 - first) as i32);
-            let discount = if ends { 0.0 } else { discount };
-            assert!((got.discount - discount).abs() < 1e-6, "{n_steps}");
-        }
-        // The transitions of the last steps all lead to the same state.
-        let short = &got[got.len().saturating_sub(4)..];
-        assert!(short.iter().all(|it| it.next == short[0].next));
+        let left = fly_episode(&mut learner.expect("new"), episode.0, episode.1);
+        let saved: SavedDecisions = left.state().expect("its state");
+        check_transitions(
+            &saved.dqn.transitions,
+            episode,
+            &config.decisions.learning,
+            scale,
+        );
     }
 }
 
 #[test]
-fn the_network_remembers_the_reward_of_each_decision() {
+fn the_network_learns_from_every_step_of_an_episode() {
     let mut config = config(BasisKind::Estimate);
-    config.dqn.learning.n_step = 1;
-    let progress = Progress::first(&worlds(), &config, &Device::Cpu);
-    let mut learner = NetworkLearner::new(progress.expect("a network"), worlds(), &config);
-    learner.attach(vec![observation(0)]).expect("possible");
-    for step in 1..5 {
-        learner.plan();
-        let mut seen = observation(step);
-        seen.robot.reward = step as f64;
-        learner.see(vec![Seen::new([seen])]).expect("possible");
-        learner.predict();
+    config.dqn.learning.n_step = 4;
+    for episode in EPISODES {
+        let progress = Progress::first(&worlds(), &config, &Device::Cpu);
+        let mut learner = NetworkLearner::new(progress.expect("a network"), worlds(), &config);
+        let left = fly_episode(&mut learner, episode.0, episode.1);
+        let saved: SavedNetwork = left.state().expect("its state");
+        check_transitions(&saved.dqn.transitions, episode, &config.dqn.learning, 1.0);
     }
-    let saved = learner.contents().expect("whole").state();
-    let saved: SavedNetwork = saved.expect("its state");
-    let rewards: Vec<f32> = saved.dqn.transitions.iter().map(|it| it.reward).collect();
-    assert_eq!(rewards, [1.0, 2.0, 3.0, 4.0]);
+}
+
+/// Checks that the step size falls linearly over 8 steps, to a quarter of `rate`.
+fn check_rates(mut learner: impl Learner, rate: f64) {
+    learner.attach(vec![observation(0)]).expect("possible");
+    let mut n_updates = 0;
+    for step in 1..12 {
+        fly(&mut learner, step);
+        for update in learner.learn().expect("finite") {
+            let expected = rate * (1.0 - step as f64 / 8.0).max(0.25);
+            // Decisions report the loss and the step size of their network among other columns.
+            let got = update.rate.or_else(|| update.more[1]).expect("a step size");
+            assert!((got - expected).abs() < 1e-6 * rate, "{step}: {got}");
+            n_updates += 1;
+        }
+    }
+    assert!(n_updates > 2, "{n_updates}");
+}
+
+#[test]
+fn step_sizes_fall_linearly_to_their_final_value() {
+    let mut config = config(BasisKind::Estimate);
+    let decisions = &mut config.decisions;
+    (decisions.learning.batch, decisions.updates_per_step) = (2, 1.0);
+    (decisions.steps, decisions.final_rate) = (8, 0.25);
+    let neural = &mut config.neural;
+    (neural.batch, neural.updates_per_step) = (2, 1.0);
+    (neural.steps, neural.final_rate) = (8, 0.25);
+    let learner = DecisionsLearner::new(known_base(), None, worlds(), &config);
+    check_rates(learner.expect("new"), config.decisions.rate.into());
+    let learner = NeuralLearner::new(None, None, worlds(), &config, &Device::Cpu);
+    check_rates(learner.expect("new"), config.neural.rate);
 }
 
 /// A learner of a neural belief that makes one update per step.
