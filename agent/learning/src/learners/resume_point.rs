@@ -65,12 +65,12 @@ impl ResumePoint {
 #[cfg(test)]
 impl ResumePoint {
     /// Creates a resume point without a belief.
-    pub(super) fn blank(observation: &Observation) -> Self {
+    pub(super) fn blank(observation: &Observation, estimate: Belief) -> Self {
         Self {
             place: place(observation),
             frame: observation.frame.as_bytes().to_vec(),
             belief: Vec::new(),
-            estimate: None,
+            estimate: Some(estimate),
         }
     }
 }

@@ -199,6 +199,7 @@ mod tests {
     use super::*;
     use crate::beliefs::KNOWN;
     use crate::config::AgentConfig;
+    use emberwatch_belief::Belief;
     use emberwatch_messages::message::{RobotResult, WorldResult};
     use emberwatch_messages::observation::Observation;
     use emberwatch_model::Frame;
@@ -237,25 +238,40 @@ mod tests {
     }
 
     #[test]
-    fn held_options_must_exist_and_last_for_a_valid_time() {
-        let shape = Shape::new(2, 3).expect("test shape");
+    fn errors_name_what_does_not_fit_a_robot() {
+        let shape = |width| Shape::new(2, width).expect("test shape");
         let observation = Observation {
             world: WorldResult::default(),
             robot: RobotResult::default(),
-            frame: Frame::empty(shape),
+            frame: Frame::empty(shape(3)),
         };
         let dqn = Dqn::new(AgentConfig::default().decisions.settings(), SHAPE, 3);
-        let held = |option, n_steps| {
+        let n = OPTIONS.len();
+        for (n_states, width, option, n_steps, words) in [
+            (3, 3, n - 1, 1000, ""),
+            (3, 3, n, 1, "worlds.held: expected an option below"),
+            (3, 3, 0, 1001, "worlds.held: expected an option below"),
+            (
+                3,
+                4,
+                0,
+                1,
+                "worlds.memory: expected a memory of a 2 x 3 grid",
+            ),
+            (2, 3, 0, 1, "worlds.estimate: expected 3 states on 2 x 3"),
+        ] {
+            let estimate = Belief::uniform(n_states, shape(3));
             let run = SavedRun {
-                resume_point: ResumePoint::blank(&observation),
-                memory: Memory::new(shape),
+                resume_point: ResumePoint::blank(&observation, estimate),
+                memory: Memory::new(shape(width)),
                 last: None,
                 track: dqn.track(),
                 held: Held { option, n_steps },
             };
-            run.check(3, shape).is_ok()
-        };
-        assert!(held(OPTIONS.len() - 1, 1000));
-        assert!(!held(OPTIONS.len(), 1) && !held(0, 1001));
+            let checked = run.check(3, shape(3));
+            let error = checked.map_or_else(|error| error.to_string(), |()| String::new());
+            assert!(error.starts_with(words), "{error}");
+            assert_eq!(error.is_empty(), words.is_empty(), "{error}");
+        }
     }
 }
