@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_name_and_label_identifies_one_kind() {
+    fn each_name_label_and_text_identifies_one_kind() {
         for &kind in BELIEFS {
             assert_eq!(named(kind.name), Some(kind));
             assert_eq!(named(kind.label), Some(kind));

@@ -5,6 +5,7 @@ use emberwatch_learning::beliefs::Conditions;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::Policy;
+use emberwatch_learning::rollout::agent::Agent;
 use emberwatch_learning::rollout::building::agent;
 use emberwatch_learning::rollout::{Actor, Rollout, Seen};
 use emberwatch_messages::message::{RobotResult, WorldResult};
@@ -81,17 +82,16 @@ fn missed_steps_equal_steps_with_empty_frames() {
 }
 
 #[test]
-fn an_agent_scores_its_prediction_before_the_frame_corrects_it() {
+fn a_correction_raises_the_score_of_its_frame() {
     let mut agent = robot("beam_exploit", &CELLS[..1]);
     agent.plan();
     agent.agent.predict();
     let seen = seen(1, &CELLS[..1]);
     let frame = &seen.observation.frame;
-    let [before, after] = [(); 2].map(|()| {
-        let score = agent.agent.score(frame).expect("a filter predicts frames");
-        agent.agent.correct(frame, None).expect("possible");
-        score
-    });
+    let score = |agent: &Agent| agent.score(frame).expect("a filter predicts frames");
+    let before = score(&agent.agent);
+    agent.agent.correct(frame, None).expect("possible");
+    let after = score(&agent.agent);
     assert_eq!(before.n_seen, frame.observed().count() as u64);
     assert!(before.log_likelihood < after.log_likelihood);
     assert!(after.log_likelihood < 0.0);

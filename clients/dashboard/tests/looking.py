@@ -103,10 +103,10 @@ class Look:
         return self.page.evaluate("window.emberwatch?.drawn ?? 0")
 
     def has(self, *arrays: str) -> bool:
-        """Returns whether these arrays are drawn. A page draws nothing before the server's facts
-        arrive."""
-        is_drawing = self.picture(".info") is not None
-        return is_drawing and all(self.picture(f".arrays.{name}.length") for name in arrays)
+        """Returns whether these arrays are drawn: a page draws nothing before it has the server's
+        facts."""
+        is_drawn = self.picture(".info") is not None
+        return is_drawn and all(self.picture(f".arrays.{name}.length") for name in arrays)
 
     def array(self, name: str) -> NDArray[np.uint8]:
         return self._bytes(f"window.emberwatch.picture.arrays.{name}")

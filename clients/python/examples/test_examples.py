@@ -68,7 +68,8 @@ EXAMPLES = [
 def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
     command = [sys.executable, str(FOLDER / name)]
     command += arguments.replace("OUT", str(tmp_path)).split()
-    # Finds programs that pip installed next to Python. Ray must not join another example's cluster.
+    # Finds programs that pip installed next to Python. With "local", Ray starts its own cluster
+    # instead of joining another example's.
     path = f"{os.environ['PATH']}:{Path(sys.executable).parent}"
     env = os.environ | {"PATH": path, "RAY_ADDRESS": "local"}
     done = subprocess.run(

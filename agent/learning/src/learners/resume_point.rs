@@ -64,8 +64,8 @@ impl ResumePoint {
 
 #[cfg(test)]
 impl ResumePoint {
-    /// Creates a resume point without a belief.
-    pub(super) fn blank(observation: &Observation, estimate: Belief) -> Self {
+    /// Creates a resume point with this estimate, and without an estimator's bytes.
+    pub(super) fn with_estimate(observation: &Observation, estimate: Belief) -> Self {
         Self {
             place: place(observation),
             frame: observation.frame.as_bytes().to_vec(),

@@ -262,7 +262,7 @@ mod tests {
         ] {
             let estimate = Belief::uniform(n_states, shape(3));
             let run = SavedRun {
-                resume_point: ResumePoint::blank(&observation, estimate),
+                resume_point: ResumePoint::with_estimate(&observation, estimate),
                 memory: Memory::new(shape(width)),
                 last: None,
                 track: dqn.track(),

@@ -240,7 +240,7 @@ mod tests {
             let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
             fit.earn(&belief, &visited, 0.3);
             for update in fit.learn().expect("finite") {
-                // The mean over cells. It starts at ln 2 at most, because there are two values.
+                // The mean over cells, about ln 2 at first. A sum over cells would be larger.
                 assert!(update.loss < 1.1, "{update:?}");
             }
         }
