@@ -251,13 +251,7 @@ mod tests {
             (3, 3, n - 1, 1000, ""),
             (3, 3, n, 1, "worlds.held: expected an option below"),
             (3, 3, 0, 1001, "worlds.held: expected an option below"),
-            (
-                3,
-                4,
-                0,
-                1,
-                "worlds.memory: expected a memory of a 2 x 3 grid",
-            ),
+            (3, 4, 0, 1, "worlds.memory: expected a memory of a 2 x 3"),
             (2, 3, 0, 1, "worlds.estimate: expected 3 states on 2 x 3"),
         ] {
             let estimate = Belief::uniform(n_states, shape(3));
