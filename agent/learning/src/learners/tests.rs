@@ -175,7 +175,7 @@ fn decisions_resume_bit_for_bit() {
 }
 
 /// Flies an episode in which the reward of a step is its number, and begins the next one.
-fn fly_episode(learner: &mut impl Learner, n_steps: u64, is_terminated: bool) -> Contents {
+fn fly_episode(mut learner: impl Learner, (n_steps, is_terminated): (u64, bool)) -> Contents {
     learner.attach(vec![observation(0)]).expect("possible");
     for step in 1..=n_steps {
         learner.plan();
@@ -219,11 +219,12 @@ fn check_transitions(
 
 #[test]
 fn decisions_learn_from_every_step_of_an_episode() {
-    let config = config(BasisKind::Estimate);
+    let mut config = config(BasisKind::Estimate);
+    config.decisions.learning.n_step = 4;
     let scale = config.decisions.reward_scale / worlds().n_moves as f32;
     for episode in EPISODES {
         let learner = DecisionsLearner::new(known_base(), None, worlds(), &config);
-        let left = fly_episode(&mut learner.expect("new"), episode.0, episode.1);
+        let left = fly_episode(learner.expect("new"), episode);
         let saved: SavedDecisions = left.state().expect("its state");
         check_transitions(
             &saved.dqn.transitions,
@@ -240,14 +241,15 @@ fn the_network_learns_from_every_step_of_an_episode() {
     config.dqn.learning.n_step = 4;
     for episode in EPISODES {
         let progress = Progress::first(&worlds(), &config, &Device::Cpu);
-        let mut learner = NetworkLearner::new(progress.expect("a network"), worlds(), &config);
-        let left = fly_episode(&mut learner, episode.0, episode.1);
+        let learner = NetworkLearner::new(progress.expect("a network"), worlds(), &config);
+        let left = fly_episode(learner, episode);
         let saved: SavedNetwork = left.state().expect("its state");
         check_transitions(&saved.dqn.transitions, episode, &config.dqn.learning, 1.0);
     }
 }
 
-/// Checks that the step size falls linearly over 10 steps, to a fifth of `rate`. `rate_of` returns an update's step size.
+/// Checks that the step size falls linearly over 10 steps, to a fifth of `rate`. `rate_of` returns an update's step
+/// size.
 fn check_rates(mut learner: impl Learner, rate: f64, rate_of: fn(&ModelUpdate) -> Option<f64>) {
     learner.attach(vec![observation(0)]).expect("possible");
     let mut rates = Vec::new();
