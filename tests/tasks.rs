@@ -150,7 +150,7 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
         "compare --task small --height 3 => --task <NAME|FILE> | cannot be used with | --height
 compare --task small --robots 2 => --robots | cannot be used with | --task
 train --task small --moves 3 --out x => --task <NAME|FILE> | cannot be used with | --moves
-evaluate --task ash --checkpoint x => task ash: No such file | expected a file, or one of wildfire, small
+compare --task ash => task ash: No such file | expected a file, or one of wildfire, small
 compare --task PIPE => expected a regular file, got a pipe
 run --task ash => task ash: No such file";
     check_table(AGENT, &table.replace("PIPE", &pipe));

@@ -39,8 +39,6 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
         .compare("out", policies)
         .check_prints("neural/options/rule");
     let checkpoint = place.flag("out");
-    let evaluated = agent(&format!("evaluate {COMPARED} {checkpoint}"));
-    evaluated.check_prints("neural_belief - known_model");
     // The same network also works on another grid.
     let server = Server::start(SMALL);
     let flags = format!("run {} --steps 5 --policy neural_beam", on(&server));

@@ -232,27 +232,18 @@ fn signals_and_a_dead_server_end_training_with_a_checkpoint() {
 }
 
 #[test]
-fn a_checkpoint_is_compared_evaluated_and_checked() {
+fn a_checkpoint_is_compared_and_checked() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
     place.train("own", &format!("{WORLDS} --steps 80 --kernels own"));
     let compared = place.compare("own", "");
     let (out, own) = (place.flag("out"), place.flag("own"));
-    let evaluated = agent(&format!("evaluate {COMPARED} {out}"));
     for policy in [
         "learned/shooting/exploit",
         "learned_beam",
         "learned_spatial_beam",
     ] {
         compared.check_prints(policy);
-        evaluated.check_prints(policy);
-    }
-    for row in [
-        "class frequencies",
-        "known_model",
-        "learned_filter - known_model",
-    ] {
-        evaluated.check_prints(row);
     }
     let both = format!("compare {out} {own} {COMPARED}");
     check(
@@ -292,10 +283,10 @@ fn a_checkpoint_is_compared_evaluated_and_checked() {
     std::fs::write(place.checkpoint("out"), &whole[..whole.len() / 2]).expect("cut");
     let damaged = "checkpoint.safetensors | damaged or truncated";
     place.refuse("out", &resume, damaged);
-    check(AGENT, &format!("evaluate {COMPARED} {out}"), damaged);
+    check(AGENT, &format!("compare {COMPARED} {out}"), damaged);
 }
 
-/// Invalid flags of `train`, `evaluate` and `compare`, and words of the resulting error.
+/// Invalid flags of `train` and `compare`, and words of the resulting error.
 const WRONG_FLAGS: &str = "
 train => --out
 train --out /proc/no => create /proc/no
@@ -308,8 +299,6 @@ train --out OUT --model no.toml => model file no.toml | No such file
 train --out OUT --world 3 => --world: expected 0
 train --out OUT --server no/such => start no/such | No such file
 train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: No such file
-evaluate => --checkpoint
-evaluate --checkpoint no/such => checkpoint no/such: No such file
 compare --checkpoint no/such => checkpoint no/such: No such file
 ";
 

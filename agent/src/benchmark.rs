@@ -2,7 +2,6 @@
 
 pub(crate) mod arena;
 pub(crate) mod compare;
-pub(crate) mod evaluate;
 pub mod report;
 pub(crate) mod team;
 mod world_run;

@@ -33,8 +33,6 @@ enum Command {
     Leaderboard(commands::LeaderboardCommand),
     /// Learn a model while acting, with checkpoints and metrics
     Train(commands::TrainCommand),
-    /// Compare a checkpoint's predictions and policies with the known model's
-    Evaluate(commands::EvaluateCommand),
 }
 
 /// Parses the arguments, runs the subcommand, and returns the exit code.
@@ -53,7 +51,6 @@ pub fn main() -> ExitCode {
         Command::Suite(command) => command.run(),
         Command::Leaderboard(command) => command.run(),
         Command::Train(command) => command.run(),
-        Command::Evaluate(command) => command.run(),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

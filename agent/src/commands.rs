@@ -1,7 +1,6 @@
 //! The subcommands: they parse flags, call the library, and write files and tables.
 
 mod compare;
-mod evaluate;
 mod leaderboard;
 mod prior;
 mod run;
@@ -12,7 +11,6 @@ mod trainings;
 mod worlds;
 
 pub use compare::CompareCommand;
-pub use evaluate::EvaluateCommand;
 pub use leaderboard::LeaderboardCommand;
 pub use prior::PriorCommand;
 pub use run::RunCommand;

@@ -166,27 +166,6 @@ impl Rollout {
     }
 }
 
-/// Several agents, each with its own belief.
-impl Actor for Vec<Rollout> {
-    fn plan(&mut self) -> Vec<Vec<Move>> {
-        paths_of(in_parallel(self, Rollout::plan))
-    }
-
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
-        see_all(self, seen)
-    }
-
-    fn predict(&mut self) {
-        predict_all(self);
-    }
-}
-
-/// Returns the paths of all agents' plans, in order.
-pub fn paths_of(plans: impl IntoIterator<Item = Vec<Plan>>) -> Vec<Vec<Move>> {
-    let plans = plans.into_iter().flatten();
-    plans.map(|plan| plan.moves).collect()
-}
-
 /// Corrects each agent's belief with its observation after the step. The beliefs are then posteriors.
 pub fn see_all<'a>(
     rollouts: impl IntoIterator<Item = &'a mut Rollout>,
