@@ -28,7 +28,6 @@ mod python;
 mod random_robot;
 mod recorded_worlds;
 mod recording;
-mod replays;
 mod restart;
 mod security;
 mod snapshots;

@@ -2,9 +2,9 @@
 
 use crate::commands::check_table;
 use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::message::{FrameHeader, Header, RobotResult, TruthHeader, VERSION};
+use emberwatch_protocol::message::{FrameHeader, TruthHeader};
 use emberwatch_protocol::observer::{Observer, Sample};
-use emberwatch_protocol::recording::{Event, Reader, Record, RecordingError, Writer};
+use emberwatch_protocol::recording::{Event, Reader, Record, RecordingError};
 use rustix::process::Signal;
 use std::fs::File;
 use std::io::Read;
@@ -12,19 +12,18 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tests::harness::{
-    Ended, Folder, PATIENCE, Paths, Program, SERVER, SMALL, Server, fly_on, new_instance,
-    recorded_info,
+    Ended, Folder, Paths, Program, SERVER, SMALL, Server, fly, fly_on, frames_until, new_instance,
 };
 
 /// Creates a temporary folder. Returns the folder, and the path of a file in it that does not exist yet.
-pub fn new_file() -> (TempDir, PathBuf) {
+fn new_file() -> (TempDir, PathBuf) {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("test.recording");
     (folder, file)
 }
 
 /// Starts a recorder and waits until it observes.
-pub fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
+fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
     let (name, file) = (instance.name(), file.display());
     let recorder = Program::start(
         SERVER,
@@ -34,19 +33,14 @@ pub fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program 
     recorder
 }
 
-pub fn start_replay(instance: &Instance, file: &Path, flags: &str) -> Program {
-    let (name, file) = (instance.name(), file.display());
-    Program::start(SERVER, &format!("replay {file} --instance {name} {flags}"))
-}
-
-pub fn stop(recorder: Program) -> Ended {
+fn stop(recorder: Program) -> Ended {
     let ended = recorder.finish();
     ended.check_says("recorded");
     ended
 }
 
 /// Returns the intact records at the start of a file, and the error that follows them, if any.
-pub fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
+fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
     let mut reader = Reader::new(File::open(file).expect("the file")).expect("a recording");
     let mut error = None;
     let whole = reader.by_ref().map_while(|record| match record {
@@ -59,13 +53,13 @@ pub fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
     (whole.collect(), error)
 }
 
-pub fn read_whole(file: &Path) -> Vec<Record> {
+fn read_whole(file: &Path) -> Vec<Record> {
     let (records, error) = read(file);
     assert!(error.is_none(), "{error:?}");
     records
 }
 
-pub fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
+fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
     let frame = |record: &Record| match &record.event {
         Event::Frame(sample) => Some(sample.clone()),
         _ => None,
@@ -73,7 +67,7 @@ pub fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
     records.iter().filter_map(frame).collect()
 }
 
-pub fn truths(records: &[Record]) -> Vec<Sample<TruthHeader>> {
+fn truths(records: &[Record]) -> Vec<Sample<TruthHeader>> {
     let truth = |record: &Record| match &record.event {
         Event::Truth(sample) => Some(sample.clone()),
         _ => None,
@@ -89,53 +83,30 @@ fn wait_for_step(recorder: &Program, file: &Path, step: u64) {
     });
 }
 
-/// Reads `n_samples` samples.
-pub fn take<H: Header>(observer: &Observer<H>, n_samples: usize) -> Vec<Sample<H>> {
-    let next = |index| {
-        let sample = observer.receive(PATIENCE).expect("receive");
-        sample.unwrap_or_else(|| panic!("sample {index} of {n_samples} did not come"))
-    };
-    (0..n_samples).map(next).collect()
-}
-
-/// Writes a recording of `n_frames` frames of 2 x 3 cells, `millis_apart` milliseconds apart.
-pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sample<FrameHeader>> {
-    let mut writer = Writer::new(File::create(file).expect("create")).expect("begin");
-    let info = recorded_info(1, 1);
-    let mut write = |nanos: u64, event: Event| {
-        let n_lost = 0;
-        writer
-            .write(&Record {
-                nanos,
-                n_lost,
-                event,
-            })
-            .expect("write");
-    };
-    write(0, Event::Server(Box::new(info)));
-    let mut samples = Vec::new();
-    for sequence in 0..n_frames {
-        let mut header = FrameHeader {
-            version: VERSION,
-            sequence,
-            n_robots: 1,
-            height: 2,
-            width: 3,
-            ..FrameHeader::default()
-        };
-        header.result.step = sequence;
-        let robot = RobotResult {
-            n_moves: 1,
-            ..RobotResult::default()
-        };
-        let payload = [bytemuck::bytes_of(&robot), &[255, 0, 255, 255, 1, 255, 3]].concat();
-        let sample = Sample { header, payload };
-        let nanos = sequence * millis_apart * 1_000_000;
-        write(nanos, Event::Frame(sample.clone()));
-        samples.push(sample);
+#[test]
+fn a_recording_holds_byte_for_byte_what_observers_received() {
+    let server = Server::start(&format!("{SMALL} --worlds 2 --publish-truth"));
+    let (_folder, file) = new_file();
+    let recorder = start_recorder(&server.instance, &file, "--truth");
+    let observer = Observer::frames(&server.instance).expect("observe");
+    let mut client = server.acquire(1..2);
+    let (mut paths, mut seen) = (Paths::new(3), Vec::new());
+    for step in 1..=40 {
+        fly(&mut client, paths.next(6));
+        seen.extend(frames_until(&observer, 1, step));
     }
-    writer.finish().expect("finish");
-    samples
+    let last = seen.last().expect("frames").header.sequence;
+    let is_last = |it: &Sample<FrameHeader>| it.header.sequence == last;
+    recorder.until(|| frames(&read(&file).0).iter().any(is_last));
+    let ended = stop(recorder);
+    assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);
+    ended.check_says("steps=40");
+    let records = read_whole(&file);
+    let recorded = frames(&records);
+    let same = recorded.iter().position(|sample| *sample == seen[0]);
+    assert_eq!(recorded[same.expect("the first")..], seen[..]);
+    let hidden = truths(&records);
+    assert!(hidden.iter().any(|sample| sample.header.step == 40));
 }
 
 #[test]
@@ -154,13 +125,7 @@ fn a_killed_recorder_leaves_whole_records() {
         Some(RecordingError::Cut { offset, got, .. }) => assert_eq!(offset + got, length),
         other => panic!("expected a cut, got {other:?}"),
     }
-    let instance = new_instance();
-    let observer = Observer::frames(&instance).expect("observe");
-    let replay = start_replay(&instance, &file, "--speed max");
-    let recorded = frames(&records);
-    assert_eq!(take(&observer, recorded.len()), recorded);
-    drop(observer);
-    replay.ends(0).check_says("cut short");
+    assert!(frames(&records).iter().any(|frame| frame.header.result.step == 30));
 }
 
 #[test]
@@ -262,30 +227,6 @@ fn a_recorder_ends_after_its_steps_with_its_worlds_alone() {
 }
 
 #[test]
-fn a_damaged_recording_is_replayed_up_to_the_damage() {
-    let (_folder, file) = new_file();
-    let samples = write_recording(&file, 5, 0);
-    let mut bytes = std::fs::read(&file).expect("read");
-    let at = bytes.len() - 160; // in the fourth frame's record
-    bytes[at] ^= 1;
-    std::fs::write(&file, &bytes).expect("write");
-    let (records, error) = read(&file);
-    let good = frames(&records);
-    assert!(matches!(error, Some(RecordingError::Damaged { .. })));
-    assert!((1..5).contains(&good.len()) && good[..] == samples[..good.len()]);
-    // The first frame is from a reset and counts as no step.
-    let words = format!("good before it: {} steps", good.len() - 1);
-    let instance = new_instance();
-    let observer = Observer::frames(&instance).expect("observe");
-    let replay = start_replay(&instance, &file, "");
-    assert_eq!(take(&observer, good.len()), good);
-    drop(observer);
-    replay.ends(0).check_says(&words);
-    let refused = start_replay(&instance, &file, "--strict").ends(1);
-    refused.check_says(&words);
-}
-
-#[test]
 fn nobody_else_reads_a_recording() {
     let server = Server::start(&format!("{SMALL} --publish-truth"));
     let (folder, file) = new_file();
@@ -310,37 +251,14 @@ fn nobody_else_reads_a_recording() {
 #[test]
 fn wrong_input_is_named() {
     let folder = Folder::default();
-    let good = folder.path("good");
-    write_recording(&good, 2, 0);
-    let bytes = folder.bytes("good");
-    let mut damaged = bytes.clone();
-    damaged[60] ^= 4;
-    let mut table = r#"
+    let table = r#"
 record => --out
 record --out / => --out / | --force
 record --out /no/such => --out /no/such: No such file
 record --out GOOD => --out | expected a new file | --force
 record --worlds x --out o => --worlds | 'x'
-replay => FILE
-replay no/such => recording no/such: No such file
-replay / => recording /: Is a directory
-replay FOREIGN => not a recording | got "a text t"
-replay DAMAGED => damaged at byte 16: checksum: expected
-replay START => cut short: expected a whole record at byte 16, got 0 bytes; good before it: 0 steps
-replay GOOD --from 9 => expected samples after the first 9s, got none
-replay GOOD --from x => --from | expected a number of seconds
-replay GOOD --instance a/b => instance name | "a/b"
-replay GOOD --speed 0 => --speed | above 0, or max
-replay GOOD --speed nan => --speed | above 0, or max
 "#
-    .replace("GOOD", &folder.word("good"));
-    for (name, bytes) in [
-        ("FOREIGN", &b"a text that is no recording"[..]),
-        ("DAMAGED", &damaged),
-        ("START", &bytes[..16]),
-    ] {
-        table = table.replace(name, &folder.write(&name.to_lowercase(), bytes));
-    }
+    .replace("GOOD", &folder.write("good", "left as it is"));
     check_table(SERVER, &table);
-    assert_eq!(folder.bytes("good"), bytes, "left as it was");
+    assert_eq!(folder.text("good"), "left as it is");
 }

@@ -2,12 +2,10 @@
 
 mod print;
 mod record;
-mod replay;
 mod running;
 mod snapshots;
 
 pub use print::print;
 pub use record::RecordCommand;
-pub use replay::ReplayCommand;
 pub use running::{StatusCommand, StopCommand};
 pub use snapshots::{ForkCommand, RestoreCommand, SnapshotCommand};

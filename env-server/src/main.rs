@@ -43,8 +43,6 @@ enum Command {
     Fork(commands::ForkCommand),
     /// Record the frames that an instance publishes to a file
     Record(commands::RecordCommand),
-    /// Publish a recording in the same way as the recorded server
-    Replay(commands::ReplayCommand),
 }
 
 fn main() -> ExitCode {
@@ -66,7 +64,6 @@ fn run(cli: &Cli) -> Result<()> {
         Some(Command::Restore(command)) => command.run(),
         Some(Command::Fork(command)) => command.run(),
         Some(Command::Record(command)) => command.run(),
-        Some(Command::Replay(command)) => command.run(),
         None => {
             let checked = cli.flags.effective()?.check()?;
             if cli.check {

@@ -15,8 +15,6 @@ mod serve;
 mod state;
 mod taken;
 
-pub use liveness::Clients;
-pub use port_config::PortConfig;
 pub use ports::Ports;
 pub use serve::serve;
 pub use state::announce_reach;

@@ -1,7 +1,6 @@
 //! The maximum sizes of messages on a server's ports.
 
 use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::payload::ROBOT_BYTES;
 
 /// The instance and the maximum sizes of its messages.
@@ -16,27 +15,6 @@ pub struct PortConfig {
     pub answer_bytes: usize,
     /// Whether to publish hidden states.
     pub publish_truth: bool,
-}
-
-impl PortConfig {
-    /// Returns the message sizes of an instance without worlds.
-    pub fn empty(instance: Instance) -> Self {
-        Self {
-            instance,
-            n_cells: 0,
-            frame_bytes: 0,
-            answer_bytes: 0,
-            publish_truth: false,
-        }
-    }
-
-    /// Increases the sizes to fit the samples of a server's worlds.
-    pub fn fit(&mut self, info: &ServerInfo) {
-        let n_cells = info.height * info.width;
-        let n_bytes = frame_bytes(info.n_robots, n_cells, info.n_moves);
-        self.n_cells = self.n_cells.max(n_cells);
-        self.frame_bytes = self.frame_bytes.max(n_bytes);
-    }
 }
 
 /// Returns the maximum length of a sample on `frames`, in bytes.

@@ -78,21 +78,17 @@ impl Ports {
     pub fn open(checked: &Checked) -> Result<Self> {
         let (n_cells, config) = (checked.shape.n_cells(), &checked.config);
         let of_robots = config.robots as usize * (ROBOT_BYTES + n_cells);
-        Self::open_with(&PortConfig {
+        let config = PortConfig {
             instance: checked.instance.clone(),
             n_cells,
             frame_bytes: frame_bytes(config.robots, n_cells, config.moves),
             answer_bytes: config.worlds as usize * (WORLD_BYTES + of_robots),
             publish_truth: checked.config.publish_truth,
-        })
-    }
-
-    /// Opens ports for messages of the configured sizes.
-    pub fn open_with(config: &PortConfig) -> Result<Self> {
+        };
         WatchedProcess::check()?;
-        check_shared_memory(config)?;
+        check_shared_memory(&config)?;
         raise_limit()?;
-        once_free(|| Self::open_once(config))
+        once_free(|| Self::open_once(&config))
     }
 
     fn open_once(config: &PortConfig) -> Result<Self> {

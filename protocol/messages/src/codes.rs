@@ -70,8 +70,7 @@ pub enum Status {
     Resetting = 11,
     /// The episode of a world was truncated, so the world must be reset first; detail: the world.
     EpisodeOver = 12,
-    /// The request asks for full frames from a server that does not provide them, or for an action in a replay; detail:
-    /// 0.
+    /// The request asks for full frames from a server that does not provide them; detail: 0.
     NotPermitted = 13,
     /// An unknown flag; detail: the flags received.
     UnknownFlags = 14,
@@ -163,9 +162,7 @@ impl Status {
             }
             Self::EpisodeOver => format!("world {detail} was truncated: reset it first"),
             Self::NotPermitted => {
-                "not permitted: full frames need a server with coverage \"client\" or \"full\", and a \
-                 replay takes no steps"
-                    .into()
+                "not permitted: full frames need a server with coverage \"client\" or \"full\"".into()
             }
             Self::UnknownFlags => {
                 format!("flags: expected 1 (full coverage), 2 (team frames), both or 0, got {detail}")
