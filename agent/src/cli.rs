@@ -21,8 +21,6 @@ enum Command {
     /// Act on one world of a running server
     #[command(after_long_help = policy::help())]
     Run(commands::RunCommand),
-    /// Write a filter's first belief to a file
-    Prior(commands::PriorCommand),
     /// Compare policies on the same worlds, with a table, CSV and figures
     #[command(after_long_help = policy::help())]
     Compare(commands::CompareCommand),
@@ -46,7 +44,6 @@ pub fn main() -> ExitCode {
     }
     let result = match &command {
         Command::Run(command) => command.run(),
-        Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
         Command::Suite(command) => command.run(),
         Command::Leaderboard(command) => command.run(),

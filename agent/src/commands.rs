@@ -2,7 +2,6 @@
 
 mod compare;
 mod leaderboard;
-mod prior;
 mod run;
 mod shared;
 mod suite;
@@ -12,7 +11,6 @@ mod worlds;
 
 pub use compare::CompareCommand;
 pub use leaderboard::LeaderboardCommand;
-pub use prior::PriorCommand;
 pub use run::RunCommand;
 pub use suite::SuiteCommand;
 pub use train::TrainCommand;

@@ -1,4 +1,3 @@
 //! All tests in one program, because each test program would link candle separately.
 
-mod prior;
 mod report;
