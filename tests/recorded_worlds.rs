@@ -237,12 +237,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     let ladder = act(&format!(
         "compare --seeds 0..2 {checkpoint} --figures {figures}"
     ));
-    for words in [
-        "coverage",
-        "learned_beam",
-        "clairvoyant_beam",
-        "2 worlds, 23 steps each",
-    ] {
+    for words in ["coverage", "learned_beam", "2 worlds, 23 steps each"] {
         ladder.check_prints(words);
     }
     assert!(!ladder.stdout.contains("| beam_"), "{}", ladder.stdout);

@@ -16,14 +16,14 @@ use tests::harness::{
 };
 
 /// Creates a temporary folder. Returns the folder, and the path of a file in it that does not exist yet.
-fn new_file() -> (TempDir, PathBuf) {
+pub fn new_file() -> (TempDir, PathBuf) {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("test.recording");
     (folder, file)
 }
 
 /// Starts a recorder and waits until it observes.
-fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
+pub fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
     let (name, file) = (instance.name(), file.display());
     let recorder = Program::start(
         SERVER,
@@ -33,7 +33,7 @@ fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
     recorder
 }
 
-fn stop(recorder: Program) -> Ended {
+pub fn stop(recorder: Program) -> Ended {
     let ended = recorder.finish();
     ended.check_says("recorded");
     ended
@@ -53,13 +53,13 @@ fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
     (whole.collect(), error)
 }
 
-fn read_whole(file: &Path) -> Vec<Record> {
+pub fn read_whole(file: &Path) -> Vec<Record> {
     let (records, error) = read(file);
     assert!(error.is_none(), "{error:?}");
     records
 }
 
-fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
+pub fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
     let frame = |record: &Record| match &record.event {
         Event::Frame(sample) => Some(sample.clone()),
         _ => None,
@@ -125,7 +125,11 @@ fn a_killed_recorder_leaves_whole_records() {
         Some(RecordingError::Cut { offset, got, .. }) => assert_eq!(offset + got, length),
         other => panic!("expected a cut, got {other:?}"),
     }
-    assert!(frames(&records).iter().any(|frame| frame.header.result.step == 30));
+    assert!(
+        frames(&records)
+            .iter()
+            .any(|frame| frame.header.result.step == 30)
+    );
 }
 
 #[test]

@@ -3,7 +3,6 @@
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
-use emberwatch_learning::checkpoint;
 use emberwatch_learning::config::{AgentConfig, KernelKind};
 use emberwatch_learning::learners::decisions::SavedDecisions;
 use tests::harness::{AGENT, SMALL, Server, repository};
@@ -165,24 +164,4 @@ fn decisions_on_a_known_model_go_on_with_it() {
     assert_eq!(saved(&place, "out").1, "known_model");
     let is_same = place.bytes("out") == place.bytes("same");
     assert!(is_same, "checkpoints of the same training differ");
-}
-
-#[test]
-fn decisions_of_an_earlier_release_resume_with_own_kernels() {
-    let place = place();
-    place.train("out", &format!("{WORLDS} --kernels own --steps 20"));
-    let path = place.checkpoint("out");
-    let (kind, mut contents) = checkpoint::read(&path).expect("a checkpoint");
-    let mut decisions: SavedDecisions = contents.state().expect("its state");
-    decisions.estimator = "learned_own_filter".into();
-    contents.set_state(&decisions);
-    let new = "kernels = \"own\"\n";
-    assert!(contents.settings.contains(new), "{}", contents.settings);
-    let without = contents.settings.replace(new, "");
-    contents.settings = without.replace("learned_filter", "learned_own_filter");
-    checkpoint::write(&path, &kind, &contents).expect("written");
-    place.compare("out", "").check_prints("learned_policy");
-    place.train("out", &format!("{WORLDS} --resume --steps 4"));
-    let expected = (KernelKind::Own, "learned_filter".to_owned());
-    assert_eq!(saved(&place, "out"), expected);
 }

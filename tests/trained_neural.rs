@@ -2,7 +2,7 @@
 //! that use this belief.
 
 use crate::commands::{agent, check};
-use crate::trainings::{COMPARED, Place, WORLDS, on};
+use crate::trainings::{Place, WORLDS, on};
 use tests::harness::{AGENT, SMALL, Server};
 
 const SETTINGS: &str = "learner = \"neural\"

@@ -216,7 +216,7 @@ impl TrainingLoop {
             let mut contents = contents.map_err(|error| spec.stopped(error, &*self.learner))?;
             contents.settings = toml::to_string(&spec.config)?;
             let place = spec.out.join(CHECKPOINT);
-            checkpoint::write(&place, self.kind.checkpoints[0], &contents)?;
+            checkpoint::write(&place, self.kind.checkpoint, &contents)?;
             self.stopwatch.write()?;
         }
         self.metrics.flush()?;

@@ -19,7 +19,7 @@ pub use self::known::{
 };
 pub use self::learned::{LEARNED, LEARNED_CAVITIES, LEARNED_SPATIAL, LEARNED_SPATIAL_CAVITIES};
 pub use self::neural::{NEURAL, NEURAL_SENSOR};
-pub use self::truth::{NEXT_TRUTH, NONE, TRUTH};
+pub use self::truth::{NONE, TRUTH};
 pub use self::world_form::WorldForm;
 
 /// All kinds, ordered by how much they know about the world.
@@ -38,7 +38,6 @@ pub const BELIEFS: &[&BeliefKind] = &[
     &NEURAL_SENSOR,
     &AUTOENCODER,
     &TRUTH,
-    &NEXT_TRUTH,
 ];
 
 /// Finds a kind by its name or its label.

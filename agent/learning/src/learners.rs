@@ -49,9 +49,9 @@ pub fn named(name: &str) -> Result<&'static LearnerKind, String> {
 /// If there is no such kind. The error lists all kinds of checkpoint.
 pub fn of_checkpoint(name: &str) -> Result<&'static LearnerKind> {
     let mut kinds = LEARNERS.iter().copied();
-    let kind = kinds.find(|kind| kind.checkpoints.contains(&name));
+    let kind = kinds.find(|kind| kind.checkpoint == name);
     kind.with_context(|| {
-        let names = listed(LEARNERS.iter().map(|kind| kind.checkpoints[0]));
+        let names = listed(LEARNERS.iter().map(|kind| kind.checkpoint));
         format!("expected a checkpoint of one of the kinds {names}, got {name}")
     })
 }

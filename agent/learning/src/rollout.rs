@@ -166,6 +166,22 @@ impl Rollout {
     }
 }
 
+/// Several agents, each with its own belief.
+impl Actor for Vec<Rollout> {
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let plans = in_parallel(self, Rollout::plan);
+        plans.into_iter().flatten().map(|plan| plan.moves).collect()
+    }
+
+    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+        see_all(self, seen)
+    }
+
+    fn predict(&mut self) {
+        predict_all(self);
+    }
+}
+
 /// Corrects each agent's belief with its observation after the step. The beliefs are then posteriors.
 pub fn see_all<'a>(
     rollouts: impl IntoIterator<Item = &'a mut Rollout>,

@@ -311,11 +311,6 @@ fn check(
         needs_model(policy)
     );
     ensure!(
-        policy.belief.input != Input::NextStates,
-        "policy {:?} needs worlds that run one step ahead: only `compare` has them",
-        policy.name
-    );
-    ensure!(
         policy.belief.input != Input::States || info.publish_truth,
         "policy {:?} needs the truth channel: start the server with --publish-truth",
         mission.policy

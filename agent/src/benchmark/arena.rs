@@ -1,8 +1,7 @@
 //! The worlds on which policies are compared, the same for all policies.
 //!
-//! One server's worlds form three groups: the *main* worlds, on which policies act; the same number of *scouts* with
-//! the same seeds, one step ahead, for clairvoyant policies; and one *spare*, for full observations. A scout shows the
-//! main world's exact future, because a world does not depend on the robots' paths.
+//! One server's worlds form two groups: the *main* worlds, on which policies act; and one *spare*, for full
+//! observations.
 
 use crate::acting::mission::{check_recorded, needs_model, recorded_states};
 use crate::benchmark::team::Team;
@@ -24,7 +23,7 @@ use emberwatch_protocol::{Client, Grid, Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
-/// Maximum number of main worlds in a batch. With scouts and a spare, their hidden states fit a reader's buffer.
+/// Maximum number of main worlds in a batch. With a spare, their hidden states fit a reader's buffer.
 pub const MAX_BATCH: u32 = 32;
 
 /// Time to live of an unused lease on a comparison's worlds.
@@ -41,29 +40,22 @@ pub struct Arena {
     /// The model with which beliefs predict recorded worlds, if one was given.
     known: Option<Model>,
     main: Range<u32>,
-    scouts: Range<u32>,
     spare: Option<u32>,
     /// Number of robots per agent: one, or all robots of a world.
     crew: usize,
 }
 
 impl Arena {
-    /// Acquires up to `n_seeds` main worlds, the same number of scouts if needed, and a spare if there is one.
-    pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self> {
+    /// Acquires up to `n_seeds` main worlds, and a spare if there is one.
+    pub fn open(instance: &Instance, n_seeds: u32) -> Result<Self> {
         let unfit =
             |needs: &str| format!("instance {:?}: comparing needs {needs}", instance.name());
         let connection = connect(instance)?;
         let (n_worlds, team) = (connection.info().n_worlds, connection.info().n_robots);
-        let per_main = if needs_scouts { 2 } else { 1 };
-        let n_main = (n_worlds / per_main).min(n_seeds).min(MAX_BATCH);
-        let needs = format!(
-            "{per_main} worlds for these policies, got {n_worlds}: start the server with --worlds {per_main}"
-        );
-        ensure!(n_main > 0, unfit(&needs));
-        let used = n_main * per_main;
-        let spare = (n_worlds > used).then_some(used);
+        let n_main = n_worlds.min(n_seeds).min(MAX_BATCH);
+        let spare = (n_worlds > n_main).then_some(n_main);
         let claim = Claim {
-            robots: 0..(used + u32::from(spare.is_some())) * team,
+            robots: 0..(n_main + u32::from(spare.is_some())) * team,
             takeover: false,
             // The time to live is long, because simulating the prior can take long. Closing the connection still ends
             // the lease at once.
@@ -89,7 +81,6 @@ impl Arena {
             model,
             known: None,
             main: 0..n_main,
-            scouts: n_main..used,
             spare,
             crew: 1,
         })
@@ -159,21 +150,15 @@ impl Arena {
         self.n_robots() / self.crew
     }
 
-    /// Starts the main worlds (and scouts) with these seeds; returns what agents see at k = 0, by world.
+    /// Starts the main worlds with these seeds; returns what agents see at k = 0, by world.
     pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>> {
-        let orders = |first: u32| {
-            seeds.iter().zip(first..).map(|(&seed, world)| WorldSeed {
-                world,
-                seed: Some(seed),
-            })
-        };
-        let main: Vec<WorldSeed> = orders(self.main.start).collect();
-        self.client.reset(&main)?;
+        let orders = seeds.iter().zip(self.main.start..);
+        let orders = orders.map(|(&seed, world)| WorldSeed {
+            world,
+            seed: Some(seed),
+        });
+        self.client.reset(&orders.collect::<Vec<_>>())?;
         let truth = self.states(self.range(&self.main, seeds), seeds, 0)?;
-        if !self.scouts.is_empty() {
-            let scouts: Vec<WorldSeed> = orders(self.scouts.start).collect();
-            self.client.reset(&scouts)?;
-        }
         let robots = self.robots(&self.range(&self.main, seeds));
         let observations = self.client.observe(robots)?;
         Ok(self.seen(observations, &truth))
@@ -186,20 +171,6 @@ impl Arena {
             seeds,
             step,
         }
-    }
-
-    /// Returns the hidden states at `step` from the scouts, before the main worlds reach that step.
-    ///
-    /// # Errors
-    /// If the step fails, or if the server does not publish hidden states.
-    pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
-        let worlds = self.range(&self.scouts, seeds);
-        let robots = self.robots(&worlds);
-        let paths = vec![self.any_path(); robots.len()];
-        self.client.step(robots, &paths)?;
-        let states = self.states(worlds, seeds, step)?;
-        let states = states.into_iter().collect::<Option<_>>();
-        states.context("scouts need the truth channel: start the server with --publish-truth")
     }
 
     /// Returns what a robot that sees every cell would have observed in a seed's world at `step`, which is at least 1.

@@ -19,7 +19,7 @@ use emberwatch_learning::rollout::{
     self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
 };
 use emberwatch_protocol::feed::Feed;
-use emberwatch_protocol::{Grid, Model, Move};
+use emberwatch_protocol::{Model, Move};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::ops::Range;
@@ -184,7 +184,7 @@ impl Match<'_> {
     /// Checks that the contestant can act in the arena.
     fn check(&self, arena: &Arena) -> Result<()> {
         let policy = &self.contestant.policy;
-        let needs_truth = matches!(policy.belief.input, Input::States | Input::NextStates);
+        let needs_truth = policy.belief.input == Input::States;
         ensure!(
             arena.shows_truth() || !(needs_truth || self.comparison.first_state_known),
             "it needs the truth channel: start the server with --publish-truth"
@@ -203,9 +203,6 @@ impl Match<'_> {
         arena.fly_as(self.contestant.team);
         let mut players = self.start(arena, feed)?;
         for step in 1..=self.comparison.steps {
-            if self.contestant.policy.belief.input == Input::NextStates {
-                players.foresee(&arena.foresee(self.seeds, step)?)?;
-            }
             players.is_last = step == self.comparison.steps;
             rollout::step(&mut players, &mut arena.batch(self.seeds, step))?;
             progress(&self.contestant.policy.name, players.worlds.len() as u64);
@@ -296,17 +293,6 @@ impl Players<'_> {
     /// Returns the number of agents per world.
     fn n_agents(&self) -> usize {
         self.rollouts.len() / self.worlds.len()
-    }
-
-    /// Passes the next hidden states to the clairvoyant agents, world by world.
-    fn foresee(&mut self, next: &[Grid<u8>]) -> Result<()> {
-        let n_agents = self.n_agents();
-        for (rollouts, next) in self.rollouts.chunks_mut(n_agents).zip(next) {
-            for rollout in rollouts {
-                rollout.agent.foresee(next)?;
-            }
-        }
-        Ok(())
     }
 
     fn measure(&mut self, records: &[StepRecord]) {

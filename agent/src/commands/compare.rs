@@ -16,7 +16,7 @@ use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
-use emberwatch_learning::beliefs::{Input, NONE};
+use emberwatch_learning::beliefs::NONE;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_learning::learned::Learned;
@@ -41,7 +41,7 @@ const TEAM_POLICY: &str = "beam_exploit";
 pub struct CompareCommand {
     /// Policies, separated by commas, as names or as BELIEF/PLANNER/GOAL; `help` lists names and parts; `options`
     /// stands for each option, the rule and the learned choice, on the belief of learned decisions [default: a ladder
-    /// of policies from random to clairvoyant; with teams: beam_exploit]
+    /// of policies from random to oracle; with teams: beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
     /// Policy to compare the other policies with, paired by world [default: shooting_exploit; with options: the option
@@ -106,9 +106,9 @@ impl CompareCommand {
         let added = self.read_added()?;
         let mut report = Report::default();
         for n_robots in numbers {
-            let mut worlds = self.worlds.open(self.needs_scouts(), n_robots, |model| {
-                self.policies(model, &learned).map(|_| ())
-            })?;
+            let mut worlds = self
+                .worlds
+                .open(n_robots, |model| self.policies(model, &learned).map(|_| ()))?;
             let arena = &mut worlds.arena;
             let dashboard = self
                 .watch
@@ -286,17 +286,6 @@ impl CompareCommand {
             "shooting_exploit"
         };
         Ok(found.map_or(default, |policy| &policy.name).to_owned())
-    }
-
-    fn needs_scouts(&self) -> bool {
-        let is_clairvoyant = |name: &String| {
-            let belief = policy::belief_of(name);
-            belief.is_some_and(|belief| belief.input == Input::NextStates)
-        };
-        match self.policies.as_slice() {
-            [] => !self.has_teams(),
-            names => names.iter().any(is_clairvoyant),
-        }
     }
 }
 

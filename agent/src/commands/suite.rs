@@ -15,7 +15,7 @@ use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
-use emberwatch_learning::beliefs::{Input, WorldForm};
+use emberwatch_learning::beliefs::WorldForm;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::{self, Policy};
@@ -74,14 +74,6 @@ impl SuiteCommand {
         }
         let mut names = self.policies.iter();
         names.try_for_each(|name| policy::check_name(name))?;
-        let mut beliefs = self
-            .policies
-            .iter()
-            .filter_map(|name| policy::belief_of(name));
-        ensure!(
-            beliefs.all(|belief| belief.input != Input::NextStates),
-            "--policies: clairvoyant policies, which see the next hidden states, run only in `compare`: remove them"
-        );
         let config = self.settings.effective()?;
         let folder = self.checkpoints.as_deref();
         if let Some(folder) = folder.filter(|_| !self.train) {
@@ -248,7 +240,7 @@ impl SuiteCommand {
             "--publish-truth",
         ];
         let server = OwnServer::start(self.server.clone(), &flags.map(String::from))?;
-        Ok((Arena::open(server.instance(), n_worlds, false)?, server))
+        Ok((Arena::open(server.instance(), n_worlds)?, server))
     }
 }
 

@@ -96,7 +96,6 @@ impl WorldFlags {
     /// `n_robots`: robots per world; `None`: one robot on a started server, any number on a running server.
     pub fn open(
         &self,
-        needs_scouts: bool,
         n_robots: Option<u32>,
         check: impl Fn(&Model) -> Result<()>,
     ) -> Result<Worlds> {
@@ -108,7 +107,7 @@ impl WorldFlags {
             }
             None => {
                 self.grid.check()?.as_ref().map_or(Ok(()), check)?;
-                let mut arguments = self.server_arguments(needs_scouts);
+                let mut arguments = self.server_arguments();
                 if self.grid.task.is_none() {
                     arguments.extend(robot_arguments(n_robots.unwrap_or(1)));
                 }
@@ -116,7 +115,7 @@ impl WorldFlags {
                 (server.instance().clone(), Some(server))
             }
         };
-        let mut arena = Arena::open(&instance, self.n_seeds(), needs_scouts)?;
+        let mut arena = Arena::open(&instance, self.n_seeds())?;
         if let Some(model) = self.grid.model_of_states()? {
             arena.know(model)?;
         }
@@ -163,9 +162,8 @@ impl WorldFlags {
         (seeds.end - seeds.start) as u32
     }
 
-    fn server_arguments(&self, needs_scouts: bool) -> Vec<String> {
-        let batch = self.n_seeds().min(MAX_BATCH);
-        let worlds = batch * if needs_scouts { 2 } else { 1 } + 1;
+    fn server_arguments(&self) -> Vec<String> {
+        let worlds = self.n_seeds().min(MAX_BATCH) + 1;
         let burn_in = self.burn_in.unwrap_or(BENCHMARK_BURN_IN);
         let mut arguments = self.grid.arguments(worlds, self.seeds().start, burn_in);
         let rest = ["--coverage", "client", "--publish-truth"];

@@ -5,7 +5,7 @@ use emberwatch_learning::beliefs::BeliefKind;
 use emberwatch_learning::checkpoint::{self, Contents};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners::decisions::{belief_of, belief_of_saved};
+use emberwatch_learning::learners::decisions::belief_of;
 use emberwatch_learning::learners::{self, Learner, LearnerKind};
 use emberwatch_network::Device;
 use emberwatch_protocol::connection::ConnectionError;
@@ -57,10 +57,10 @@ impl TrainingSpec {
         }
         let (got, contents) = checkpoint::read(&place)?;
         ensure!(
-            kind.checkpoints.contains(&&*got),
+            kind.checkpoint == got,
             "checkpoint {}: expected a checkpoint of {}, got one of {got}",
             place.display(),
-            kind.checkpoints[0]
+            kind.checkpoint
         );
         Ok(Some(contents))
     }
@@ -112,7 +112,7 @@ impl TrainingSpec {
         let (_, contents) = checkpoint::read(&place)?;
         let settings = contents.settings();
         let settings = settings.with_context(|| format!("checkpoint {}", place.display()))?;
-        let belief = belief_of_saved(&settings.decisions.estimator);
+        let belief = belief_of(&settings.decisions.estimator);
         let belief = belief.with_context(|| format!("checkpoint {}", place.display()))?;
         let Some(by) = &belief.learned_by else {
             return Ok(None);

@@ -162,10 +162,13 @@ impl Status {
             }
             Self::EpisodeOver => format!("world {detail} was truncated: reset it first"),
             Self::NotPermitted => {
-                "not permitted: full frames need a server with coverage \"client\" or \"full\"".into()
+                "not permitted: full frames need a server with coverage \"client\" or \"full\""
+                    .into()
             }
             Self::UnknownFlags => {
-                format!("flags: expected 1 (full coverage), 2 (team frames), both or 0, got {detail}")
+                format!(
+                    "flags: expected 1 (full coverage), 2 (team frames), both or 0, got {detail}"
+                )
             }
             Self::BadFile => "the file cannot be used".into(),
             Self::NotKept => format!("not kept: the nearest step that is kept is {detail}"),

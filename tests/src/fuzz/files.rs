@@ -117,7 +117,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
         // Checkpoints of the decisions learner also contain a filter, but a filter learner can resume only from its own
         // checkpoints.
-        if learners::filter::FILTER.checkpoints.contains(&&*kind) {
+        if learners::filter::FILTER.checkpoint == kind {
             learn(&contents, filter.tables.dimensions.sees_own_state);
         }
     }
@@ -203,7 +203,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
     // The large autoencoder claims a size of 30 GiB, but no decoder may allocate so much.
     [
         ("filter", "learned_filter", filter(dimensions(false))),
-        ("own_filter", "learned_own_filter", filter(dimensions(true))),
+        ("own_filter", "learned_filter", filter(dimensions(true))),
         ("filter_of_rings", "learned_filter", filter(of_rings)),
         ("autoencoder", "autoencoder", autoencoder(8, 4)),
         ("autoencoder_large", "autoencoder", autoencoder(4096, 256)),

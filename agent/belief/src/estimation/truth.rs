@@ -13,9 +13,6 @@ pub struct Oracle {
     transition: Transition,
 }
 
-/// An oracle that receives X_{k+1}, the states that the next path will observe.
-pub struct Clairvoyant(pub Belief);
-
 /// A constant belief, as if nothing were ever observed.
 pub struct Unchanging(pub Belief);
 
@@ -56,29 +53,6 @@ impl Estimator for Oracle {
 impl Told for Oracle {
     fn tell(&mut self, states: &Grid<u8>) -> Result<(), BeliefError> {
         self.belief = Belief::from_states(states, self.belief.n_states())?;
-        Ok(())
-    }
-}
-
-impl Estimator for Clairvoyant {
-    fn correct(&mut self, _: &Frame) -> Result<(), EstimatorError> {
-        Ok(())
-    }
-
-    fn predict(&mut self) {}
-
-    fn belief(&self) -> &Belief {
-        &self.0
-    }
-
-    fn told(&mut self) -> Option<&mut dyn Told> {
-        Some(self)
-    }
-}
-
-impl Told for Clairvoyant {
-    fn tell(&mut self, states: &Grid<u8>) -> Result<(), BeliefError> {
-        self.0 = Belief::from_states(states, self.0.n_states())?;
         Ok(())
     }
 }

@@ -37,8 +37,6 @@ pub enum Input {
     Frames,
     /// The hidden states X_k, for oracles.
     States,
-    /// The hidden states X_{k+1} that the next path will encounter, for clairvoyants.
-    NextStates,
 }
 
 /// The learner of a kind of belief.

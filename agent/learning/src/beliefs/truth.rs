@@ -1,7 +1,7 @@
 //! Beliefs that ignore frames: oracles, which receive the hidden states, and the constant first belief.
 
 use super::kind::{BeliefKind, Input};
-use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
+use emberwatch_belief::estimation::truth::{Oracle, Unchanging};
 
 pub const NONE: BeliefKind = BeliefKind {
     name: "none",
@@ -26,13 +26,4 @@ pub const TRUTH: BeliefKind = BeliefKind {
         Ok(Box::new(oracle))
     },
     ..NONE
-};
-
-pub const NEXT_TRUTH: BeliefKind = BeliefKind {
-    name: "next_truth",
-    label: "next_truth",
-    about: "the hidden states that the next path will meet; only in `compare`",
-    input: Input::NextStates,
-    build: |conditions| Ok(Box::new(Clairvoyant(conditions.prior()?))),
-    ..TRUTH
 };

@@ -23,9 +23,8 @@ pub struct LearnerKind {
     pub name: &'static str,
     /// Short description of the result.
     pub about: &'static str,
-    /// Names of the learner's kind of checkpoint: the name that new files contain, followed by names from earlier
-    /// releases.
-    pub checkpoints: &'static [&'static str],
+    /// Name of the learner's kind of checkpoint.
+    pub checkpoint: &'static str,
     /// Names of the values that its updates report besides loss and step size.
     pub columns: &'static [&'static str],
     /// Whether it supports only a single robot in a single world.

@@ -5,7 +5,7 @@ mod base;
 mod run;
 mod saved;
 
-pub use self::base::{Base, belief_of, belief_of_saved};
+pub use self::base::{Base, belief_of};
 pub use self::saved::{SHAPE, SavedDecisions};
 
 use self::run::{Run, features};
@@ -32,7 +32,7 @@ use std::collections::BTreeMap;
 pub const DECISIONS: LearnerKind = LearnerKind {
     name: "decisions",
     about: "A DQN that chooses among options on an estimator's belief, which is trained first unless given",
-    checkpoints: &["decisions"],
+    checkpoint: "decisions",
     columns: &["dqn_loss", "dqn_rate", "epsilon"],
     is_single: false,
     steps: |config| config.decisions.steps,

@@ -43,7 +43,7 @@ pub struct FilterLearner {
 pub const FILTER: LearnerKind = LearnerKind {
     name: "filter",
     about: "A Bayes filter of the paper's form, with learned parameters",
-    checkpoints: &["learned_filter", "learned_own_filter"],
+    checkpoint: "learned_filter",
     columns: &[],
     is_single: false,
     steps: |_| 0,

@@ -29,7 +29,7 @@ use emberwatch_network::{Transition, Window};
 pub const AUTOENCODER: LearnerKind = LearnerKind {
     name: "autoencoder",
     about: "The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives",
-    checkpoints: &["autoencoder"],
+    checkpoint: "autoencoder",
     columns: &["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"],
     is_single: true,
     steps: |_| 0,

@@ -37,7 +37,7 @@ use std::collections::BTreeMap;
 pub const NEURAL: LearnerKind = LearnerKind {
     name: "neural",
     about: "A convolutional network that predicts observations from earlier ones",
-    checkpoints: &["neural_belief"],
+    checkpoint: "neural_belief",
     columns: &[],
     is_single: false,
     steps: |config| config.neural.steps,

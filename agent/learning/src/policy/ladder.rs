@@ -4,8 +4,8 @@ use super::decisions::LearnedDecisions;
 use super::parts::{Goal, Policy};
 use super::planners::{self, AHEAD, BEAM, RANDOM, SHOOTING};
 use crate::beliefs::{
-    AUTOENCODER, BeliefKind, Input, KNOWN, KNOWN_SPATIAL, LEARNED, LEARNED_SPATIAL, NEURAL,
-    NEXT_TRUTH, NONE, TRUTH,
+    AUTOENCODER, BeliefKind, Input, KNOWN, KNOWN_SPATIAL, LEARNED, LEARNED_SPATIAL, NEURAL, NONE,
+    TRUTH,
 };
 use crate::learned::Learned;
 use emberwatch_belief::planning::options::OPTIONS;
@@ -31,7 +31,6 @@ pub fn ladder(model: &Model) -> Vec<Policy> {
         (&TRUTH, &BEAM, Exploit),
         (&TRUTH, &AHEAD, Exploit),
         (&TRUTH, &planners::BY_OPTIONS, Rule),
-        (&NEXT_TRUTH, &BEAM, Exploit),
     ];
     let all = first.into_iter().chain(states).chain(rest);
     all.map(|(belief, planner, goal)| Policy::new(belief, planner, goal, model))
@@ -88,7 +87,7 @@ mod tests {
         let names: Vec<&str> = policies.iter().map(|policy| &*policy.name).collect();
         let expected = "random_walk coverage shooting_explore shooting_normal shooting_latent shooting_exploit \
              shooting_exploit_only beam_exploit spatial_shooting spatial_beam oracle_shooting oracle_beam oracle_ahead \
-             oracle_policy clairvoyant_beam";
+             oracle_policy";
         assert_eq!(names.join(" "), expected);
     }
 

@@ -29,7 +29,6 @@ pub(super) const NAMED: &[(&str, &str)] = &[
     ("oracle_beam", "truth/beam/exploit"),
     ("oracle_ahead", "truth/ahead/exploit"),
     ("oracle_policy", "truth/options/rule"),
-    ("clairvoyant_beam", "next_truth/beam/exploit"),
 ];
 
 /// Prefixes for policies whose goal is one state: `shooting_STATE` is short for `known/shooting/STATE`.
@@ -159,38 +158,6 @@ pub fn belief_of(name: &str) -> Option<&'static BeliefKind> {
     parse(name, &|_| Some(0), "").ok().map(|parts| parts.0)
 }
 
-/// Converts a legacy name to the names of the parts: `BELIEF_PLANNER`, `BELIEF_OPTION`, `beam_GOAL` or
-/// `autoencoder_explore`. Existing tables and leaderboards contain such names.
-fn former(name: &str) -> Option<String> {
-    const BEGINNINGS: [(&str, &str); 10] = [
-        ("known_", "known"),
-        ("spatial_", "known+spatial"),
-        ("learned_own_spatial_", "learned+spatial"),
-        ("learned_own_", "learned"),
-        ("learned_spatial_", "learned+spatial"),
-        ("learned_", "learned"),
-        ("neural_", "neural"),
-        ("autoencoder_", "autoencoder"),
-        ("oracle_", "truth"),
-        ("clairvoyant_", "next_truth"),
-    ];
-    if let Some(goal) = name.strip_prefix("beam_") {
-        return Some(format!("known/beam/{goal}"));
-    }
-    let mut beginnings = BEGINNINGS.iter();
-    let (rest, belief) =
-        beginnings.find_map(|(first, belief)| Some((name.strip_prefix(first)?, belief)))?;
-    let is_option = |name| options::OPTIONS.iter().any(|option| option.name == name);
-    Some(match rest {
-        "shooting" | "beam" | "ahead" => format!("{belief}/{rest}/exploit"),
-        "explore" => format!("{belief}/shooting/explore"),
-        "policy" => format!("{belief}/options/learned"),
-        "rule" => format!("{belief}/options/rule"),
-        option if is_option(option) => format!("{belief}/options/{option}"),
-        _ => return None,
-    })
-}
-
 type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
 
 /// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the states' names for
@@ -201,7 +168,7 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
         Some((_, parts)) => (*parts).to_owned(),
         None => match name.strip_prefix(OF_STATE.0) {
             Some(of) if state(of).is_some() => format!("{}{of}", OF_STATE.1),
-            _ => former(name).unwrap_or_else(|| name.to_owned()),
+            _ => name.to_owned(),
         },
     };
     let one_of = |names: &str| format!("one of {names}");
@@ -329,31 +296,6 @@ mod tests {
             }
         }
         assert!(n_policies > 200, "{n_policies}");
-    }
-
-    #[test]
-    fn legacy_names_stand_for_the_same_policies() {
-        let model = Model::wildfire();
-        for (name, expected) in [
-            ("beam_explore", "known/beam/explore"),
-            ("beam_exploit_only", "known/beam/exploit_only"),
-            ("beam_latent", "known/beam/latent"),
-            ("learned_shooting", "learned/shooting/exploit"),
-            ("learned_own_spatial_beam", "learned_spatial_beam"),
-            ("learned_own_policy", "learned_policy"),
-            ("learned_spatial_policy", "learned+spatial/options/learned"),
-            ("neural_shooting", "neural/shooting/exploit"),
-            ("autoencoder_explore", "autoencoder/shooting/explore"),
-            ("autoencoder_beam", "autoencoder/beam/exploit"),
-            ("known_rule", "known/options/rule"),
-            ("spatial_best_region", "known+spatial/options/best_region"),
-            ("oracle_exploit", "truth/options/exploit"),
-            ("clairvoyant_ahead", "next_truth/ahead/exploit"),
-        ] {
-            let policy = Policy::named(name, &model).expect(name);
-            assert_eq!(policy.name, expected);
-            check_name(name).expect("known before its model");
-        }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use crate::parallel::in_parallel;
 use crate::policy::Policy;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::Estimator;
-use emberwatch_belief::estimation::belief::{Belief, BeliefError};
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::scoring::{Score, score};
 use emberwatch_belief::planning::options::choose_by_rule;
 use emberwatch_belief::planning::team::{ROUNDS, plan_team};
@@ -281,11 +281,6 @@ impl Agent {
         if self.basis == BasisKind::Estimate {
             self.estimate = estimate.cloned();
         }
-    }
-
-    /// Passes the states X_{k+1}, which the next path will encounter, to an oracle. Other estimators ignore them.
-    pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
-        self.estimator.told().map_or(Ok(()), |told| told.tell(next))
     }
 
     /// Returns the belief, which is about X_k after `correct` and about X_{k+1} after `predict`.

@@ -2,7 +2,7 @@
 
 use super::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use crate::beliefs::autoencoder::AutoencoderModel;
-use crate::beliefs::{Conditions, Input, WorldForm};
+use crate::beliefs::{Conditions, WorldForm};
 use crate::config::AgentConfig;
 use crate::learned::Learned;
 use crate::policy::{BY_OPTIONS, Goal, Policy, network_choices};
@@ -53,13 +53,12 @@ pub fn agent(
 }
 
 /// Returns the belief that a policy plans on, the estimate or the predictor. A policy with a DQN uses the belief that
-/// was used in the DQN's training, because the DQN's values depend on it. A clairvoyant always plans on the next
-/// states. For all other policies, the settings decide.
+/// was used in the DQN's training, because the DQN's values depend on it. For all other policies, the settings
+/// decide.
 fn basis(policy: &Policy, config: &AgentConfig, learned: &Learned) -> Result<BasisKind> {
     Ok(match policy.goal {
         Goal::Learned if policy.chooses_options() => policy.decisions(learned)?.basis,
         Goal::Learned => network(learned)?.basis,
-        _ if policy.belief.input == Input::NextStates => BasisKind::Predictor,
         _ => config.objective.belief,
     })
 }

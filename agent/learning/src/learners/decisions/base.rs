@@ -18,14 +18,6 @@ pub fn belief_of(name: &str) -> Result<&'static BeliefKind> {
     kind.map_err(|problem| anyhow::anyhow!("decisions.estimator: {problem}"))
 }
 
-/// Finds a belief by its name in a checkpoint. Earlier releases had other names for filters with own-state kernels.
-///
-/// # Errors
-/// Under the same conditions as [`belief_of`].
-pub fn belief_of_saved(name: &str) -> Result<&'static BeliefKind> {
-    belief_of(&name.replace("learned_own_", "learned_"))
-}
-
 /// A kind of belief with everything needed to build it.
 pub struct Base {
     pub kind: &'static BeliefKind,

@@ -1,6 +1,6 @@
 //! Checkpoints of decisions: the DQN, the belief that it was trained on, and the state of the robots.
 
-use super::base::{Base, belief_of_saved};
+use super::base::{Base, belief_of};
 use crate::beliefs::learned::{LearnedModel, SavedModel};
 use crate::beliefs::neural::{NeuralModel, SavedNeuralModel};
 use crate::beliefs::{BeliefKind, NEURAL};
@@ -117,7 +117,7 @@ pub(super) fn read(contents: &Contents, device: &Device, learned: &mut Learned) 
 impl SavedDecisions {
     /// Returns the kind of belief that the decisions are based on.
     pub fn kind(&self) -> Result<&'static BeliefKind> {
-        belief_of_saved(&self.estimator)
+        belief_of(&self.estimator)
     }
 
     /// Returns the belief that the decisions are based on, if it was learned. Networks compute on `device`.
