@@ -54,13 +54,6 @@ run --beam-width 0 => beam_width: expected 1 to 10000, got 0
 run --instance nobody --policy ash => policy: expected one of random_walk | BELIEF/PLANNER/GOAL | got "ash"
 run --instance nobody --policy known/beam/ash --wait 0 => no server on instance "nobody"
 run --instance nobody --policy known/beam/ash --model wildfire => "known/beam/ash": goal: expected one of | fire, got "ash"
-prior => --model | --height | --width | --burn-in | --out
-prior --model ash --height 4 --width 4 --burn-in 1 --out o => model file ash: No such file
-prior --model wildfire --height 4 --width 4 --burn-in 1 --out / => --out: expected the path of a regular file, got /
-prior --model wildfire --height 4 --width 4 --burn-in 1 --out /no/such/p.npy => --out: expected a file in a writable folder
-prior --model wildfire --height 4 --width 4 --burn-in 1 --out /proc/p.npy => /proc/p.npy
-prior --model wildfire --height 0 --width 4 --burn-in 1 --out o => height and width in 1..=4096, got 0 x 4
-prior --model wildfire --height 4 --width 4 --burn-in 1 --out o --worlds 0 => --worlds | 1..=10000
 compare --seeds 8..0 => --seeds | FIRST below END
 compare --seeds 3 => --seeds | FIRST..END
 compare --steps 0 => --steps | 1..=10000000
@@ -163,20 +156,6 @@ fn status_and_a_second_server_report_the_first() {
     assert_eq!(status["worlds"][1]["seed"], 41);
     server.command("stop").check(0);
     server.program.ends(0);
-}
-
-#[test]
-fn the_documented_prior_is_written() {
-    let page = include_str!("../docs/commands.md");
-    let mut quoted = page.split('`').skip(1).step_by(2);
-    let command = quoted.find(|command| command.starts_with("prior "));
-    let folder = Folder::default();
-    let command = command
-        .expect("the command")
-        .replace("FILE", &folder.word("prior.npy"));
-    // Uses fewer worlds and a shorter burn-in than documented, because only the flags are checked.
-    agent(&command.replace("--burn-in 10000", "--burn-in 10 --worlds 1"));
-    assert!(folder.path("prior.npy").is_file());
 }
 
 #[test]

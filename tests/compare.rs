@@ -37,8 +37,8 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     let [csv, figures] = ["new/out.csv", "figures"].map(|name| folder.word(name));
     let ended = agent(&format!("{WHAT} {WORLDS} --csv {csv} --figures {figures}"));
     let rows = read_runs(&folder.path("new/out.csv")).expect("rows");
-    // The default comparison on the wildfire model has fifteen policies, with two seeds each.
-    assert_eq!(rows.len(), 15 * 2, "{rows:?}");
+    // The default comparison on the wildfire model has fourteen policies, with two seeds each.
+    assert_eq!(rows.len(), 14 * 2, "{rows:?}");
     for pair in rows.as_chunks::<2>().0 {
         ended.check_prints(&pair[0].policy);
         for (run, of_first) in pair.iter().zip(&rows) {
@@ -183,9 +183,9 @@ fn a_second_model_runs_from_end_to_end() {
     assert_eq!(server.step_of(0), 40);
     let figures = Folder::default();
     let rows = compare(&format!("{flags} --figures {}", figures.word("figures")));
-    // The default comparison has sixteen policies here, because it has one policy for each of the three states without
+    // The default comparison has fifteen policies here, because it has one policy for each of the three states without
     // a reward.
-    assert_eq!(rows.len(), 16 * 2, "{rows:?}");
+    assert_eq!(rows.len(), 15 * 2, "{rows:?}");
     assert!(figures.path("figures/snapshot.svg").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
     let flags = format!("--steps 3 --beam-width 5 {model}");

@@ -324,7 +324,7 @@ mod tests {
             ("learned/beam/fire", "goal: expected one of coverage, "),
             ("shooting_ash", "got \"shooting_ash\""),
             ("learned_", "got \"learned_\""),
-            ("beam_ash", "policy \"beam_ash\": goal: expected one of "),
+            ("beam_explore", "got \"beam_explore\""),
         ] {
             let error = Policy::named(name, &model).expect_err(name).to_string();
             assert!(error.contains(words), "{error}");
