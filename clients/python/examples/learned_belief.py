@@ -293,6 +293,8 @@ def arguments() -> argparse.Namespace:
         parser.error(
             f"--out: expected a folder without the log of an earlier training, got {args.out}"
         )
+    if args.suite is not None and (args.suite / "small" / f"{args.name}.csv").exists():
+        parser.error(f"--suite: expected a folder without rows of {args.name}, got {args.suite}")
     return args
 
 

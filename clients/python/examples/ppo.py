@@ -327,7 +327,10 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--lambda", dest="lambda_", type=float, default=0.9)
     parser.add_argument("--entropy", type=float, default=0.01)
     parser.add_argument("--threads", type=int, default=1)
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.suite is not None and (args.suite / "small" / f"{args.name}.csv").exists():
+        parser.error(f"--suite: expected a folder without rows of {args.name}, got {args.suite}")
+    return args
 
 
 def main() -> None:
@@ -348,6 +351,7 @@ def main() -> None:
             policy, folder=args.suite, tasks=["small"], window=args.window, timeout=60.0, **shared
         )["small"]
     else:
+        (args.out / "rows.csv").unlink(missing_ok=True)  # from an earlier training
         first, end = map(int, args.evaluate.split(".."))
         rows = evaluate(
             policy,

@@ -111,6 +111,7 @@ def main() -> None:
     model.get_env().close()
     draw(log)
 
+    (args.out / "rows.csv").unlink(missing_ok=True)  # from an earlier training
     first, end = map(int, args.evaluate.split(".."))
     rows = evaluate(
         model,

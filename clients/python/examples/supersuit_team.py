@@ -71,6 +71,7 @@ def main() -> None:
     model.save(args.out / "ppo")
     envs.close()
 
+    (args.out / "rows.csv").unlink(missing_ok=True)  # from an earlier training
     first, end = map(int, args.evaluate.split(".."))
     scores = evaluate(
         model,

@@ -1,9 +1,7 @@
 """`emberwatch.benchmark`, compared with `emberwatch-agent compare`."""
 
-import io
 import subprocess
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +114,7 @@ def test_replayed_paths_have_exactly_the_same_scores(
 def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
     file, figures = tmp_path / "mine.csv", tmp_path / "figures"
     score(file)
-    score(file, name="other")
+    score(file, name="other", append=True)
     flags = ["--policies=random_walk,coverage", "--baseline=coverage", f"--add={file}"]
     done = compare(*flags, f"--figures={figures}", f"--csv={tmp_path / 'all.csv'}", *private())
     assert done.returncode == 0, done.stderr
@@ -144,21 +142,6 @@ def test_rows_on_other_worlds_are_refused(
     assert done.stderr.count("--add") == 1
 
 
-def test_an_evaluation_continues_where_it_stopped(tmp_path: Path) -> None:
-    file, told = tmp_path / "new" / "mine.csv", io.StringIO()
-    whole = score(batch=4)
-    score(file, name="other")
-    first = score(file, seeds=range(3, 5))
-    kept = file.read_bytes()
-    rows = score(file, batch=1, progress=told)
-    assert rows[:2] == first and len(rows) == 4
-    assert [row.mean_fire_cells for row in rows] == [row.mean_fire_cells for row in whole]
-    assert kept != file.read_bytes() and len(read(file)) == 8
-    assert "mine: 4 test worlds" in told.getvalue()
-    assert f"mine: 2 rows kept in {file}, not run again" in told.getvalue()
-    assert list(file.parent.iterdir()) == [file]
-
-
 def test_a_row_names_the_estimator_of_the_belief() -> None:
     for changes, expected in (
         ({"observation": "frame"}, "none"),
@@ -176,28 +159,66 @@ def test_a_summary_counts_the_test_worlds() -> None:
     assert summary(rows).endswith("a step on 2 (1 test) worlds")
     assert summary(rows[:1]).endswith(" a step on 1 test world, too few for a standard error")
     assert summary(rows[1:]).endswith(" a step on 1 world, too few for a standard error")
-    other = [replace(row, policy="other") for row in rows]
-    assert [line[:6] for line in summary(rows + other).splitlines()] == ["mine: ", "other:"]
     with refuses("rows: expected at least one, got none"):
         summary([])
+
+
+def rows_of(policy: str, *rewards: float, first: int = 1000, **changes: Any) -> list[Row]:
+    values: dict[str, Any] = {
+        **{"policy": policy, "estimator": "none", "steps": 5, "moves": 4, "mean_plan_millis": 0.1},
+        **{"mean_distinct_cells": 4.0, "hit_rate": 0.1, "mean_fire_cells": 9.0, "brier": ""},
+        **{"worlds_fingerprint": "ab"},
+    }
+    return [
+        Row(world_seed=seed, mean_reward=reward, **values | changes)
+        for seed, reward in enumerate(rewards, first)
+    ]
+
+
+def test_a_summary_has_differences_from_a_baseline() -> None:
+    base, better = rows_of("base", 1.0, 2.0, 4.0), rows_of("better", 2.0, 5.0, 9.0)
+    # Differences 1, 3 and 5: mean 3, variance 4, error sqrt(4 / 3) = 1.155. Student's t with 2
+    # degrees of freedom is 4.303 at 97.5 %, so the interval is 3 +- 4.97.
+    assert summary([*better[::-1], *base], baseline="base").splitlines() == [
+        "better: 5.33 +- 2.03 a step on 3 worlds; difference from base: +3.00 +- 1.15 [-1.97, "
+        "+7.97]",
+        "base: 2.33 +- 0.88 a step on 3 worlds",
+    ]
+    assert summary(base + better).splitlines()[1] == "better: 5.33 +- 2.03 a step on 3 worlds"
+    # Differences 0.1, 0.3 and eight zeros: t with 9 degrees of freedom is 2.262.
+    others = rows_of("base", *[0.0] * 10), rows_of("better", 0.1, 0.3, *[0.0] * 8)
+    assert summary([*others[0], *others[1]], baseline="base").endswith(
+        "+0.04 +- 0.03 [-0.03, +0.11]"
+    )
+    one = summary(base[:1] + better[:1], baseline="base").splitlines()[1]
+    assert one.endswith("on 1 world, too few for a standard error; difference from base: +1.00")
+    for rows, problem in (
+        (better, "baseline: expected the name of one of the policies better, got 'base'"),
+        (base + rows_of("base", 1.0, team="shared"), "baseline: expected the name of one of the"),
+        (base + better[:2], "rows: expected one for each of the same worlds and steps of 'better'"),
+        (base + better + better, "rows: expected one for each of the same worlds and steps of"),
+        (base + rows_of("x", 1.0, 2.0, 4.0, first=1001), "rows: expected one for each of the same"),
+        (base + rows_of("x", 1.0, 2.0, 4.0, steps=6), "rows: expected one for each of the same w"),
+        (base + rows_of("x", 1.0, worlds_fingerprint="cd"), "in all rows, got 'ab', 'cd'"),
+        (
+            rows_of("base", 1.0, worlds_fingerprint=""),
+            "same worlds_fingerprint in all rows, got ''",
+        ),
+    ):
+        with refuses(problem):
+            summary(rows, baseline="base")
 
 
 #: Wrong arguments of `evaluate`, each with words of its error.
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"name": ""}, "name: expected a name for the table, got ''"),
-    ({"estimator": "a\nb"}, r"estimator: expected a name for the table, or None, got 'a\\nb'"),
+    ({"estimator": "a\nb"}, r"estimator: expected a name for the table, got 'a\\nb'"),
     *(({"seeds": it}, "seeds: expected at least one seed, without dup") for it in ([], [4, 4])),
     ({"seeds": 8}, r"seeds: expected several seeds, such as range\(8\), got 8"),
-    *(
-        ({name: value}, f"{name}: evaluate sets it; leave it out")
-        for name, value in {
-            "reward": "move", "num_envs": 2, "max_episode_steps": 9, "autoreset_mode": "SameStep",
-        }.items()
-    ),
     ({"observation": None}, "observation: expected one or several of"),
     ({"seeds": [-1]}, "seed: expected an integer"),
     *(
-        ({name: 0}, f"{name}: expected at least 1, got 0")
+        ({name: 0}, f"{name}: expected an integer within 1 to 4294967295, got 0")
         for name in ("steps", "batch", "recent_steps")
     ),
     ({"env": "CartPole-v1"}, f"env: expected '{MOVES}' or '{WILDFIRE}', got 'CartPole-v1'"),

@@ -1,12 +1,12 @@
-"""CSV files of rows: written by several processes, and files that cannot be written."""
+"""The files that `evaluate` and `suite` write: whole, new or appended to, or partial."""
 
-import fcntl
-import itertools
+import importlib
+import io
 import os
 import resource
 import signal
-import threading
-from collections import Counter
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,163 +15,256 @@ import pytest
 from benchmarks import WORLDS
 from environments import LIVELY
 from failures import refuses
-from processes import script
 
-from emberwatch.benchmark import Row, evaluate, read, row_file
-from emberwatch.benchmark.row_file import Kind, Mark, RowFile
+from emberwatch.benchmark import Row, evaluate, read, suite
+from emberwatch.errors import ExistingFileError
 
-WRITER = """
-import sys, numpy as np
-from emberwatch.benchmark import evaluate
-name, csv, model = sys.argv[1:]
-sys.stdin.readline()  # so that both begin together
-evaluate(
-    lambda frames: np.ones(len(frames), int), name=name, csv=csv, seeds=range(20), batch=1, steps=3,
-    model=model, height=7, width=9, n_moves=4, burn_in=60, observation="frame", progress=None,
-)
-print("done")
+TASK = f"""
+name = "lab"
+model = "{LIVELY}"
+height = 7
+width = 9
+moves = 4
+burn_in = 60
+max_steps = 5
+test_seeds = {{ start = 3, end = 6 }}
 """
 
 
-def row(policy: str, seed: int, **changes: Any) -> Row:
-    values: dict[str, Any] = {
-        **{"policy": policy, "estimator": "none", "world_seed": seed, "steps": 5},
-        **{"mean_reward": 0.5, "mean_distinct_cells": 4.0, "hit_rate": 0.1, "mean_fire_cells": 9.0},
-        **{"mean_plan_millis": 0.1, "brier": "", "moves": 4, "recent_steps": 10},
-        **{"worlds_fingerprint": "ab" * 8, "policy_fingerprint": "cd" * 8},
-    }
-    return Row(**values | changes)
+def go(
+    csv: object, name: str = "mine", policy: Callable[[Any], Any] | None = None, **changes: Any
+) -> list[Row]:
+    """Evaluates a policy that by default never acts."""
+    keywords = {**WORLDS, "observation": "frame", "seeds": range(3, 6), "steps": 5, **changes}
+    keywords = {"progress": None, "batch": 1} | keywords
+    return evaluate(policy or (lambda _: pytest.fail("acts")), name=name, csv=csv, **keywords)
 
 
-MARK = Mark.of(row("mine", 0))
+def up(frames: Any) -> Any:
+    return np.zeros(len(frames), int)
 
 
-def opened(path: Path, policy: str = "mine", mark: Mark = MARK) -> RowFile:
-    """Opens a file and searches it for the rows of a policy."""
-    file = RowFile(path)
-    with file:
-        file.find(Kind(policy, 1, "alone"), mark)
-    return file
+def stops_in_the_last_world(stop: Callable[[], object]) -> Callable[[Any], Any]:
+    steps = iter(range(1000))
+    return lambda frames: stop() if next(steps) == 50 else up(frames)
 
 
-def calls_of(csv: object) -> int:
-    """Returns how often a policy acts before a file is refused."""
-    calls = itertools.count()
-
-    def still(frames: Any) -> Any:
-        next(calls)
-        return np.zeros(len(frames), int)
-
-    keywords = {**WORLDS, "observation": "frame", "seeds": [3], "steps": 2, "progress": None}
-    with refuses("^csv: expected "):
-        evaluate(still, name="mine", csv=csv, **keywords)
-    return next(calls)
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "mine.csv"
 
 
-def test_two_processes_writing_one_file_lose_no_rows(tmp_path: Path) -> None:
-    file = tmp_path / "rows.csv"
-    writers = [script(WRITER, name, file, LIVELY) for name in ("first", "second")]
-    for writer in writers:
-        writer.say()
-    assert [writer.line() for writer in writers] == ["done"] * 2
-    assert Counter(row.policy for row in read(file)) == {"first": 20, "second": 20}
-
-
-def test_rows_written_meanwhile_are_kept_or_refused(tmp_path: Path) -> None:
-    path = tmp_path / "rows.csv"
-    first, second = opened(path), opened(path, mark=MARK._replace(policy_fingerprint="ef" * 8))
-    first.add([row("mine", 0)])
-    with refuses("csv: another process has written rows of 'mine' to .*, from another policy or"):
-        second.add([row("mine", 0, policy_fingerprint="ef" * 8)])
-    first.add([row("mine", 1)])
-    assert read(path) == [row("mine", 0), row("mine", 1)]
-    # Two halves of an evaluation may run at once; rows of other worlds are refused.
-    path = tmp_path / "halves.csv"
-    halves = opened(path), opened(path)
-    for seed, half in enumerate(halves * 2):
-        half.add([row("mine", seed)])
-    assert [row.world_seed for row in read(path)] == [0, 1, 2, 3]
-    path = tmp_path / "worlds.csv"
-    mine = opened(path)
-    other = MARK._replace(worlds_fingerprint="00" * 8)
-    opened(path, "other", other).add([row("other", 3, worlds_fingerprint="00" * 8)])
-    with refuses("has 1 rows of other worlds, of the policies 'other'"):
-        mine.add([row("mine", 0)])
-    assert [row.policy for row in read(path)] == ["other"]
-
-
-def test_a_file_locked_by_another_process_is_named(
+def test_a_policy_whose_module_was_edited_is_played(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(row_file, "_PATIENCE", 0.1)
-    path = tmp_path / "rows.csv"
-    with path.open("w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        with refuses("csv: another process has held .*rows.csv for 0.1 s"):
-            opened(path)
-    opened(path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "my_rules.py").write_text("def move(): return 3")
+    rules = importlib.import_module("my_rules")
+    rows = []
+    for move in (3, 1):
+        (tmp_path / "my_rules.py").write_text(f"def move(): return {move}  # edited")
+        importlib.reload(rules)
+        policy = lambda frames: np.full(len(frames), rules.move())  # noqa: E731
+        expected = go(None, policy=lambda frames, move=move: np.full(len(frames), move))
+        rows.append(go(tmp_path / f"{move}.csv", policy=policy))
+        assert [row.grid_seen_share for row in rows[-1]] == [it.grid_seen_share for it in expected]
+        with pytest.raises(ExistingFileError):
+            go(tmp_path / f"{move}.csv", policy=policy)
+    assert rows[0] != rows[1]
 
 
-def test_a_replaced_file_is_read_again(tmp_path: Path) -> None:
-    path = tmp_path / "rows.csv"
-    mine = opened(path)
-    path.touch()
-    with path.open() as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        thread = threading.Thread(target=mine.add, args=([row("mine", 0)],))
-        thread.start()
-        replacement = tmp_path / "replacement"
-        with replacement.open("w") as file:
-            row_file.write(file, [row("other", 0)])
-        replacement.replace(path)
-    thread.join()
-    assert [row.policy for row in read(path)] == ["mine", "other"]
+def test_a_fitted_tree_that_was_swapped_is_played(tmp_path: Path) -> None:
+    class Tree:
+        """Imitates a decision tree, whose fitted state other modules cannot see."""
+
+        def __init__(self, move: int) -> None:
+            self._fitted = memoryview(bytes([move]))
+
+        def predict(self, seen: Any) -> Any:
+            return np.full(len(seen), self._fitted[0])
+
+    rows = [go(tmp_path / f"{move}.csv", policy=Tree(move)) for move in (3, 1)]
+    fresh = go(None, policy=Tree(1))
+    assert [row.mean_reward for row in rows[1]] == [row.mean_reward for row in fresh]
+    assert [row.mean_reward for row in rows[0]] != [row.mean_reward for row in fresh]
+
+
+def test_a_file_is_written_whole_and_an_existing_one_refused(file: Path) -> None:
+    csv = file.parent / "new" / "mine.csv"
+
+    def act(frames: Any) -> Any:
+        assert not csv.exists()
+        return up(frames)
+
+    rows = go(csv, policy=act)
+    assert read(csv) == rows and os.listdir(csv.parent) == ["mine.csv"]
+    assert csv.stat().st_mode & 0o777 == 0o666 & ~umask()
+    kept = csv.read_bytes()
+    with refuses("csv: .*mine.csv already exists: choose another file, or add rows") as refused:
+        go(csv)
+    assert isinstance(refused.value, FileExistsError) and csv.read_bytes() == kept
+
+
+def umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_other_policies_are_appended(file: Path, tmp_path: Path) -> None:
+    first = go(file, policy=up, append=True)
+    file.chmod(0o640)
+    link = tmp_path / "link.csv"
+    link.symlink_to(file)
+    second = go(link, "other", up, append=True, batch=3)
+    assert read(file) == first + second and link.is_symlink()
+    assert file.stat().st_mode & 0o777 == 0o640
+    kept = file.read_bytes()
+    with refuses("name: expected one that is not in .*mine.csv, got 'other'"):
+        go(file, "other", append=True)
+    changes: list[dict[str, Any]] = [{"n_moves": 5}, {"robots": 2}, {"start": "centre"}]
+    for change in (*changes, {"steps": 6}, {"seeds": range(3, 7)}, {"burn_in": 61}):
+        with refuses("csv: .*mine.csv has rows of '(mine|other)' on other worlds: their seeds, st"):
+            go(file, "third", append=True, **change)
+    assert file.read_bytes() == kept
+
+
+def test_a_file_that_is_written_meanwhile_is_kept(file: Path) -> None:
+    go(file.with_name("other.csv"), "other", up)
+
+    def act(frames: Any) -> Any:
+        file.write_bytes(file.with_name("other.csv").read_bytes())
+        return up(frames)
+
+    with pytest.raises(ExistingFileError) as raised:
+        go(file, policy=act)
+    assert raised.value.__notes__ == [f"3 of 3 worlds finished, their rows are in {file}.partial"]
+    assert {row.policy for row in read(file)} == {"other"}
+    assert len(read(f"{file}.partial")) == 3
+
+
+def test_an_interrupted_evaluation_leaves_the_finished_rows(file: Path) -> None:
+    whole, said = go(file, policy=up), io.StringIO()
+    note = f"2 of 3 worlds finished, their rows are in {file}.partial"
+
+    def check(error: BaseException) -> None:
+        assert error.__notes__ == [note]
+        rows = read(f"{file}.partial")
+        assert [(it.policy, it.world_seed) for it in rows] == [("other", 3), ("other", 4)]
+        assert read(file) == whole and len(list(file.parent.iterdir())) == 2
+        Path(f"{file}.partial").unlink()
+
+    with pytest.raises(ZeroDivisionError) as raised:
+        policy = stops_in_the_last_world(lambda: 1 / 0)
+        go(file, "other", policy, append=True, progress=said)
+    check(raised.value)
+    assert f"other: 3 test worlds, 0 s, stopped: {note}\n" in said.getvalue()
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        go(file, "other", stops_in_the_last_world(interrupt), append=True)
+    check(stopped.value)
+    with pytest.raises(ZeroDivisionError) as raised:
+        go(None, policy=stops_in_the_last_world(lambda: 1 / 0))
+    with pytest.raises(ZeroDivisionError):
+        go(file, "other", lambda _: 1 / 0, append=True)
+    assert not hasattr(raised.value, "__notes__") and list(file.parent.iterdir()) == [file]
+
+
+def interrupt() -> None:
+    signal.raise_signal(signal.SIGINT)
 
 
 def test_unwritable_files_are_refused_before_the_policy_acts(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     os.mkfifo(tmp_path / "pipe")
-    no_place_for_a_second = tmp_path / ("x" * 251 + ".csv")
-    names = "/proc/rows.csv", "/dev/full", "/dev/null", "a\x00b", 7, tmp_path
-    for csv in (*names, tmp_path / "file/rows.csv", tmp_path / "pipe", no_place_for_a_second):
-        assert calls_of(csv) == 0
+    too_long = tmp_path / ("x" * 249 + ".csv")
+    for append in (False, True):
+        # Not even root can create a file in /proc.
+        for csv in ("/proc/rows.csv", tmp_path / "file/rows.csv", too_long):
+            with refuses("^csv: expected a file that can be written, got .*: "):
+                go(csv, append=append)
+        for csv in (tmp_path, "/dev/full", tmp_path / "pipe"):
+            with refuses("^csv: .* already exists"):
+                go(csv, append=append)
+        for csv in ("a\x00b", 7):
+            with refuses("^csv: expected "):
+                go(csv, append=append)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "pipe"]
 
 
-def test_a_full_disk_is_reported_and_keeps_old_rows(tmp_path: Path) -> None:
-    path = tmp_path / "rows.csv"
-    file = opened(path)
-    file.add([row("mine", 0)])
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+def test_a_full_disk_keeps_the_old_file_and_shows_the_rows(file: Path) -> None:
+    go(file, policy=up)
+    kept, limits = file.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+    def fill(frames: Any) -> Any:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))
+        return up(frames)
+
     try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-        with refuses("csv: expected a file that can be written, got .*rows.csv: File too large"):
-            file.add([row("mine", seed) for seed in range(1, 50)])
+        with refuses("csv: expected a file that can be written, got .*: File too large") as full:
+            go(file, "other", fill, append=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, ignored)
-    assert read(path) == [row("mine", 0)] and list(tmp_path.iterdir()) == [path]
+    assert file.read_bytes() == kept and list(file.parent.iterdir()) == [file]
+    words, _, text = full.value.__notes__[0].partition(":\n")
+    assert words == "3 of 3 worlds finished, their rows could not be saved"
+    (file.parent / "rescued.csv").write_text(text)
+    assert [row.world_seed for row in read(file.parent / "rescued.csv")] == [3, 4, 5]
 
 
-def test_a_run_without_rows_leaves_no_file(tmp_path: Path) -> None:
-    path = tmp_path / "rows.csv"
-    keywords = {**WORLDS, "observation": "frame", "seeds": [3], "steps": 2, "progress": None}
-    with pytest.raises(ZeroDivisionError):
-        evaluate(lambda _: 1 / 0, name="mine", csv=path, **keywords)
-    assert not path.exists()
-    # An empty file that existed before has no rows, and is kept.
-    path.touch()
-    assert read(path) == []
-    with pytest.raises(ZeroDivisionError):
-        evaluate(lambda _: 1 / 0, name="mine", csv=path, **keywords)
-    assert path.exists()
+def test_files_of_other_programs_are_read(file: Path) -> None:
+    head = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,"
+    head += "mean_fire_cells,mean_plan_millis,brier,moves"
+    file.write_text(f"{head}\nmine,none,3,5,1.5,4.0,0.5,7.0,0.1,,8\n")
+    (row,) = read(file)
+    assert (row.moves, row.robots, row.team, row.recent_steps) == (8, 1, "alone", None)
+    file.write_text(f"{head},policy_fingerprint\nmine,none,3,5,1.5,4.0,0.5,7.0,0.1,,8,abc\n")
+    assert read(file) == [row]
+    with refuses("csv: expected .*mine.csv to have the columns policy,.*, got others"):
+        go(file, "other", append=True)
+    file.unlink()
+    rows = go(file, policy=up)
+    # As a spreadsheet saves it.
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    assert read(file) == rows
+    assert read(file) + go(file, "other", up, append=True) == read(file)
+    text = file.read_text()
+    bad = ("mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20)
+    for content in (*(f"{text}{line}\n" for line in bad), "policy,steps\nmine,3\n", "\x00\xff"):
+        file.write_text(content, "latin-1")
+        with refuses("csv: expected .*mine.csv to have the columns policy,"):
+            read(file)
 
 
-def test_links_and_file_modes_are_preserved(tmp_path: Path) -> None:
-    path, link = tmp_path / "rows.csv", tmp_path / "link.csv"
-    path.touch(0o640)
-    link.symlink_to(path)
-    opened(link).add([row("mine", 0)])
-    assert link.is_symlink() and read(path) == [row("mine", 0)]
-    assert path.stat().st_mode & 0o777 == 0o640
+def test_a_suite_writes_one_file_for_each_task_and_policy(tmp_path: Path) -> None:
+    source, folder = tmp_path / "task.toml", tmp_path / "out"
+    source.write_text(TASK)
+    keywords: dict[str, Any] = {"folder": folder, "observation": "frame", "progress": None}
+    for name, stem in (("mine", "mine"), ("known+x/beam", "known_x_beam")):
+        rows = suite(up, name=name, tasks=[source], **keywords)
+        assert list(rows) == ["lab"] and read(folder / "lab" / f"{stem}.csv") == rows["lab"]
+        assert [(row.world_seed, row.steps) for row in rows["lab"]] == [(3, 5), (4, 5), (5, 5)]
+    with refuses("folder: .*lab/mine.csv already exists: remove it, choose another name or fol"):
+        suite(lambda _: pytest.fail("acts"), name="mine", tasks=["small", source], **keywords)
+    for name in ("", "x" * 65, "a b", "ä", "a\n", 7):
+        with refuses("name: expected 1 to 64 letters, digits and -_./., got "):
+            suite(up, name=name, tasks=[source], **keywords)
+    with refuses("tasks: expected tasks with different names, got small, small"):
+        suite(up, name="new", tasks=["small", "small"], **keywords)
+    with refuses("append: suite sets it; leave it out"):
+        suite(up, name="new", append=True, **keywords)
+
+
+def test_worlds_that_change_during_a_run_are_refused(tmp_path: Path) -> None:
+    model = tmp_path / "model.toml"
+    text = Path(LIVELY).read_text()
+    model.write_text(text)
+
+    def rewrites(frames: Any) -> Any:
+        model.write_text(text.replace("name = ", "name = 'other' # ", 1))
+        return up(frames)
+
+    with refuses("worlds: changed since the evaluation began"):
+        go(None, policy=rewrites, model=model)

@@ -65,10 +65,10 @@ def test_a_team_is_evaluated_as_a_whole(tmp_path: Path) -> None:
         return np.tile(np.array([[1, 1, 1, 1], [1, 1, 3, 3]]), (len(_["robot"]) // 2, 1))
 
     keywords: Any = {**SMALL, "start": "centre", "env": WILDFIRE, "progress": None}
-    keywords |= {"seeds": [1000, 1001], "steps": 5, "csv": tmp_path / "team.csv"}
+    keywords |= {"seeds": [1000, 1001], "steps": 5, "csv": tmp_path / "team.csv", "append": True}
     rows = evaluate(fly, name="both", robots=2, **keywords)
     assert [(row.robots, row.team) for row in rows] == [(2, "alone")] * 2
-    shared = evaluate(fly, name="both", robots=2, observation=("robot", "team"), **keywords)
+    shared = evaluate(fly, name="shared", robots=2, observation=("robot", "team"), **keywords)
     assert [row.team for row in shared] == ["shared"] * 2
     assert [row.mean_reward for row in shared] == [row.mean_reward for row in rows]
     # At first the robots share two cells, then visit two more each. Later they push against the

@@ -41,6 +41,10 @@ class InvalidArgumentError(EmberwatchError, ValueError):
     code = "invalid_argument"
 
 
+class ExistingFileError(InvalidArgumentError, FileExistsError):
+    """A file exists already. It was not changed."""
+
+
 def invalid(subject: object, expected: object, got: object) -> InvalidArgumentError:
     """Returns the error for an invalid value: ``subject: expected ..., got ...``."""
     return InvalidArgumentError(f"{subject}: expected {expected}, got {got}")

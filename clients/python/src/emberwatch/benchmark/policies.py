@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any, Final, Protocol, TypeAlias, cast
+from typing import Any, Final, TypeAlias, cast
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from emberwatch.benchmark.fitting import fits, misfit, shapes
 from emberwatch.common.arguments import as_array, repr_of
 from emberwatch.errors import InvalidArgumentError, invalid
 
@@ -27,30 +26,12 @@ _STARTS: Final = "episode_start"
 _DETERMINISTIC: Final = "deterministic"
 _MASKS: Final = "action_masks"
 
-#: The name of `episode_start` in SB3 before 1.4. A parameter `mask` has this meaning only next to
-#: the other parameters of SB3's `predict`.
-_OLD_STARTS: Final = "mask"
-_OLD: Final = frozenset((_STATE, _OLD_STARTS, _DETERMINISTIC))
-
-
-class Normalizer(Protocol):
-    """The method of SB3's `VecNormalize` that is used here."""
-
-    def normalize_obs(self, obs: Any) -> Any: ...
-
 
 class Actor:
     """A policy that acts in one batch of worlds after another, with its state in this batch."""
 
-    def __init__(self, policy: object, *, deterministic: bool, is_wrapped: bool) -> None:
-        """Determines the parameters of the policy.
-
-        Args:
-            policy: A function, or an object with `predict`.
-            deterministic: Argument of `predict`.
-            is_wrapped: Whether observations pass through the wrappers of the policy's training.
-                If False, they are normalized here, provided that the model has a `VecNormalize`.
-        """
+    def __init__(self, policy: object, *, deterministic: bool) -> None:
+        """Determines the parameters of the policy, a function or an object with `predict`."""
         predict = getattr(policy, "predict", None)
         self._call: Any = policy if predict is None else predict
         if not callable(self._call):
@@ -61,33 +42,39 @@ class Actor:
         self._begin: Any = getattr(policy, "begin", None)
         self._deterministic: Final = deterministic
         self._takes, self._needs = _parameters(self._call, is_model=predict is not None)
-        known = getattr(self._model, "get_vec_normalize_env", None)
-        normalizer: Any = known() if callable(known) else None
-        has_one = normalizer is not None and getattr(normalizer, "norm_obs", True)
-        #: The `VecNormalize` of the model's training, if it normalized observations.
-        self.normalizers = cast("list[Normalizer]", [normalizer] if has_one else [])
-        self._normalizer: Final = normalizer if has_one and not is_wrapped else None
+        #: Normalizes observations as in the training, unless wrappers do so.
+        self._normalizer = _normalizer(self._model)
         self._state: Any = None
         self._starts: NDArray[np.bool_] = np.empty(0, np.bool_)
 
-    def check(self, worlds: Any, seen: Any) -> None:
+    def check(self, worlds: Any, wrapped: Any) -> None:
         """Refuses worlds that the policy cannot act in.
 
         Args:
             worlds: A vector environment.
-            seen: The observation space of the environment, or of its wrappers.
+            wrapped: The environment behind the wrappers of the policy's training, or None. If
+                given, these normalize the observations.
         """
         if _MASKS in self._needs and not hasattr(worlds, _MASKS):
             expected = "an environment with action masks, which the policy needs"
             raise invalid("env", expected, "one without")
-        if self._normalizer is not None:
-            inner = getattr(getattr(self._normalizer, "venv", None), "observation_space", seen)
-            if shapes(inner) != shapes(seen):
-                raise misfit(inner, seen)
-            seen = getattr(self._normalizer, "observation_space", seen)
+        seen = (worlds if wrapped is None else wrapped).single_observation_space
+        normalizer = self._normalizer
+        if wrapped is not None:
+            if normalizer is not None and not wrapped.is_normalized:
+                raise InvalidArgumentError(
+                    "wrap: expected a VecNormalize among the wrappers, as the policy was trained "
+                    "behind one, got none"
+                )
+            self._normalizer = None
+        elif normalizer is not None:
+            inner = getattr(getattr(normalizer, "venv", None), "observation_space", seen)
+            if _shapes(inner) != _shapes(seen):  # `VecNormalize` changes bounds of its own space
+                raise _misfit(inner, seen)
+            seen = getattr(normalizer, "observation_space", seen)
         expected: Any = getattr(self._model, "observation_space", None)
-        if isinstance(expected, spaces.Space) and not fits(expected, seen):
-            raise misfit(expected, seen)
+        if isinstance(expected, spaces.Space) and not _fits(expected, seen):
+            raise _misfit(expected, seen)
 
     def begin(self, n_worlds: int, n_rows: int) -> None:
         """Resets the state for a new batch of worlds, and calls the policy's `begin`, if any."""
@@ -107,8 +94,8 @@ class Actor:
         given: dict[str, Any] = {}
         if _STATE in self._takes:
             given[_STATE] = self._state
-        for name in self._takes & {_STARTS, _OLD_STARTS}:
-            given[name], self._starts = self._starts, np.zeros_like(self._starts)
+        if _STARTS in self._takes:
+            given[_STARTS], self._starts = self._starts, np.zeros_like(self._starts)
         if _DETERMINISTIC in self._takes:
             given[_DETERMINISTIC] = self._deterministic
         if _MASKS in self._takes and hasattr(worlds, _MASKS):
@@ -130,10 +117,46 @@ class Actor:
         return actions
 
 
-def statistics(normalizer: Normalizer) -> dict[str, Any]:
-    """Returns the statistics and settings of a normalization."""
-    names = ("obs_rms", "clip_obs", "epsilon", "norm_obs", "norm_obs_keys")
-    return {name: getattr(normalizer, name, None) for name in names}
+def _normalizer(model: Any) -> Any:
+    """Returns the `VecNormalize` of a model's training, if it normalized observations."""
+    known = getattr(model, "get_vec_normalize_env", None)
+    normalizer: Any = known() if callable(known) else None
+    return normalizer if getattr(normalizer, "norm_obs", True) else None
+
+
+def _misfit(expected: Any, seen: Any) -> InvalidArgumentError:
+    return InvalidArgumentError(
+        f"policy: expected the observations that it was trained on, {expected}, got {seen}: pass "
+        "the observation= of its training, and if the training wrapped its worlds, wrap=, such as "
+        "lambda worlds: VecFrameStack(worlds, 4), or "
+        "lambda worlds: VecNormalize.load('statistics.pkl', worlds)"
+    )
+
+
+def _shapes(space: Any) -> Any:
+    """Returns the shape of a space, or the shapes of its parts by name."""
+    if isinstance(space, spaces.Dict):
+        return {name: part.shape for name, part in _parts(space).items()}
+    return space.shape
+
+
+def _fits(expected: Any, seen: Any) -> bool:
+    if isinstance(expected, spaces.Dict) and isinstance(seen, spaces.Dict):
+        parts, others = _parts(expected), _parts(seen)
+        return parts.keys() == others.keys() and all(_fits(parts[it], others[it]) for it in parts)
+    return bool(expected == seen or expected == _with_channels_first(seen))
+
+
+def _parts(space: Any) -> dict[str, Any]:
+    return dict(space.spaces)
+
+
+def _with_channels_first(image: Any) -> Any:
+    """Returns the space to which SB3 itself transposes images."""
+    if len(image.shape or ()) != 3:
+        return None
+    low, high = np.moveaxis(image.low, 2, 0), np.moveaxis(image.high, 2, 0)
+    return spaces.Box(low, high, dtype=image.dtype)
 
 
 def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], set[str]]:
@@ -148,8 +171,6 @@ def _parameters(call: Callable[..., Any], *, is_model: bool) -> tuple[set[str], 
     takes = known.keys() & {_STATE, _STARTS, _DETERMINISTIC, _MASKS}
     if is_model and any(each.kind is each.VAR_KEYWORD for each in parameters):
         takes |= {_STATE, _STARTS, _DETERMINISTIC}
-    if is_model and _OLD <= known.keys() and _STARTS not in takes:
-        takes.add(_OLD_STARTS)
     needed = {name for name, each in known.items() if each.default is each.empty}
     return takes, takes & needed
 

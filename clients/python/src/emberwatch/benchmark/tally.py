@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.belief.merit import MeritTally
+from emberwatch.benchmark.rows import Row
 from emberwatch.envs.observations import cells_of
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.model.moves import fly
@@ -53,6 +56,26 @@ class Tally:
             n_burning=worlds["n_target_cells"],
             states=None if truths is None or not self._knows_target else truths[:: self.n_robots],
         )
+
+    def rows(self, seeds: Sequence[int], common: dict[str, Any]) -> list[Row]:
+        """Returns the row of each world; `common`: the columns that are equal in all rows."""
+        steps = common["steps"]
+        return [
+            Row(
+                **common,
+                world_seed=seed,
+                mean_reward=float(self.reward[index]) / steps,
+                mean_distinct_cells=int(self.n_visited[index]) / steps,
+                hit_rate=int(self.n_hits[index]) / max(int(self.n_visited[index]), 1),
+                mean_fire_cells=int(self.n_fire[index]) / steps,
+                mean_plan_millis=1e3 * self.seconds / steps / len(seeds),
+                brier="",
+                moves=self.n_moves,
+                mean_repeated=1.0 - int(self.n_visited[index]) / int(self.n_visits[index]),
+                **asdict(self.merit.merit(index)),
+            )
+            for index, seed in enumerate(seeds)
+        ]
 
     def _visited(self, robots: NDArray[np.void], paths: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Returns the mask of the cells that robots of each world visited, `(n_worlds, H, W)`."""

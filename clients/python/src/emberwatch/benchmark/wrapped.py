@@ -32,15 +32,15 @@ class Wrapped:
         """
         self._base = _ScoredVecEnv(worlds)
         self._vector: Any = wrap(self._base)
-        #: The normalizing wrappers, from the outermost one inward.
-        self.normalizers: list[VecNormalize] = []
+        #: Whether one of the wrappers is a `VecNormalize`.
+        self.is_normalized = False
         layer: Any = self._vector
         while layer is not self._base:
             if not isinstance(layer, VecEnvWrapper):
                 expected = "a function that returns its argument in VecEnvWrappers of SB3"
                 raise invalid("wrap", expected, repr_of(self._vector))
             if isinstance(layer, VecNormalize):
-                self.normalizers.append(layer)
+                self.is_normalized = True
                 _fix(layer)
             layer = layer.venv
         self.single_observation_space = self._vector.observation_space
