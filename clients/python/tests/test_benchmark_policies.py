@@ -47,11 +47,6 @@ class Recurrent(Counter):
         return self.step(seen, state, episode_start)
 
 
-class Short(Counter):
-    def predict(self, seen: Any, state: Any = None) -> Any:
-        return self.step(seen, state, None)
-
-
 class Forwarding(Recurrent):
     def predict(self, seen: Any, **others: Any) -> Any:  # type: ignore[override]
         assert others.keys() == {"state", "episode_start", "deterministic"}
@@ -59,14 +54,13 @@ class Forwarding(Recurrent):
 
 
 def test_models_and_functions_receive_their_state() -> None:
-    for kind in (Recurrent, Short, Forwarding):
+    for kind in (Recurrent, Forwarding):
         model = kind()
         go(model, batch=2)
         # Worlds 3 and 4 run together, then world 5 from the start.
         counts = list(range(3 * N_MOVES))
         assert model.counts == [[n, n] for n in counts] + [[n] for n in counts], kind
-        if kind is not Short:
-            assert model.starts == [[n == 0] * 2 for n in counts] + [[n == 0] for n in counts]
+        assert model.starts == [[n == 0] * 2 for n in counts] + [[n == 0] for n in counts]
     counter = Counter()
 
     def act(frames: Any, state: Any, *, episode_start: Any) -> Any:
@@ -164,32 +158,6 @@ def test_models_and_functions_receive_masks(walled: Path) -> None:
     go(Masked(), env=WILDFIRE)
     with refuses("env: expected an environment with action masks, .* got one without"):
         go(lambda frames, action_masks: 0, env=WILDFIRE)
-
-
-class Statistics:
-    """Imitates VecNormalize."""
-
-    def normalize_obs(self, seen: Any) -> Any:
-        return seen * 0.0 + 7.0
-
-
-class Normalized:
-    def __init__(self) -> None:
-        self.seen: list[Any] = []
-
-    def get_vec_normalize_env(self) -> Statistics | None:
-        return Statistics()
-
-    def predict(self, seen: Any, deterministic: bool = False) -> Any:
-        self.seen.append(seen)
-        return np.zeros(len(seen), int), None
-
-
-def test_observations_are_normalized_as_in_the_training() -> None:
-    for observation in ("local", "frame"):
-        model = Normalized()
-        go(model, observation=observation)
-        assert np.all(np.array(model.seen) == 7.0)
 
 
 FRAME = spaces.Box(0, 255, (7, 9, 1), np.uint8)

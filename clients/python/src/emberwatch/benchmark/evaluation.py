@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, TextIO
@@ -25,7 +25,6 @@ from emberwatch.benchmark.rows import Row, text_of
 from emberwatch.benchmark.tally import Tally
 from emberwatch.client import wire
 from emberwatch.client.client import Client
-from emberwatch.client.replies import ServerInfo
 from emberwatch.common.arguments import as_count, as_seed, repr_of
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
 from emberwatch.envs.settings import Settings, WorldArguments
@@ -111,33 +110,29 @@ def evaluate(
     numbers = {"steps": steps, "batch": batch, "recent_steps": recent_steps}
     chosen = _check(name, estimator, env, seeds, **numbers)
     actor = Actor(policy, deterministic=deterministic)
-    served = _served(keywords.get("instance"))
-    robots = task.robots if task else keywords.get("robots") or 1
-    if served is not None and served.n_robots != robots:
-        raise invalid("robots", f"the server's {served.n_robots}", robots)
-    # Worlds in this process can always reveal their hidden states.
-    defaults = {"truth": served is None or served.publish_truth, "timeout": _TIMEOUT}
-    if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
-        burn_in = _BURN_IN
-    setting = _Setting(env, {**defaults, **keywords, "burn_in": burn_in}, robots, wrap)
+    setting = _setting(env, task, burn_in, wrap, keywords)
     with setting.made(1) as (worlds, wrapped):
         actor.check(worlds, wrapped)
     if setting.keywords["truth"]:
         batch = min(batch, wire.TRUTH_BUFFER)
-    fingerprint = _worlds_fingerprint(setting.keywords, served)
-    common = {
-        **_about(name, estimator, robots, keywords.get("observation")),
-        **{"steps": steps, "recent_steps": recent_steps, "worlds_fingerprint": fingerprint},
+    parts = set(names_of(keywords.get("observation")))
+    columns = {
+        "policy": name,
+        "estimator": estimator or ("known_model" if OF_BELIEF & parts else "none"),
+        "robots": setting.n_robots,
+        "team": "shared" if setting.n_robots > 1 and OF_TEAM & parts else "alone",
+        "steps": steps,
+        "recent_steps": recent_steps,
+        "worlds_fingerprint": setting.fingerprint,
     }
-    file = None
-    if csv is not None:
-        file = RowFile(csv, append=append)
-        file.check(name, {(fingerprint, seed, steps) for seed in chosen})
+    file = None if csv is None else RowFile(csv, append=append)
+    if file is not None:
+        file.check(name, {(setting.fingerprint, seed, steps) for seed in chosen})
     report = Progress(progress, name, chosen, steps)
     rows: list[Row] = []
     try:
         for first in range(0, len(chosen), batch):
-            rows += _play(setting, actor, chosen[first : first + batch], common, report)
+            rows += _play(setting, actor, chosen[first : first + batch], columns, report)
         if file is not None:
             file.save(rows)
     except BaseException as error:
@@ -158,6 +153,7 @@ class _Setting:
     keywords: dict[str, Any]
     n_robots: int
     wrap: Callable[[Any], Any] | None
+    fingerprint: str
 
     @contextmanager
     def made(self, n_worlds: int) -> Generator[tuple[Any, Any]]:
@@ -182,49 +178,49 @@ def _wrapped(worlds: Any, wrap: Callable[[Any], Any]) -> Any:
     return Wrapped(worlds, wrap)
 
 
-def _served(instance: str | None) -> ServerInfo | None:
-    """Returns the description of a running server."""
-    if instance is None:
-        return None
-    with Client(instance) as client:
-        return client.info
-
-
-def _worlds_fingerprint(keywords: Mapping[str, Any], served: ServerInfo | None) -> str:
-    """Returns the fingerprint of the worlds, the same for all seeds, without simulating them."""
+def _setting(
+    env: str,
+    task: Task | None,
+    burn_in: int | None,
+    wrap: Callable[[Any], Any] | None,
+    keywords: dict[str, Any],
+) -> _Setting:
+    """Adds the defaults of an evaluation to the keywords of the environment."""
+    served = None
+    if keywords.get("instance") is not None:
+        with Client(keywords["instance"]) as client:
+            served = client.info
+    n_robots = task.robots if task else keywords.get("robots") or 1
+    if served is not None and served.n_robots != n_robots:
+        raise invalid("robots", f"the server's {served.n_robots}", n_robots)
+    if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
+        burn_in = _BURN_IN
+    # Worlds in this process can always reveal their hidden states.
+    defaults = {"truth": served is None or served.publish_truth, "timeout": _TIMEOUT}
+    keywords = {**defaults, **keywords, "burn_in": burn_in}
     if served is None:
         world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
-        return _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))
-    return served.worlds_fingerprint or ""
-
-
-def _about(name: str, estimator: str | None, robots: int, observation: Any) -> dict[str, Any]:
-    """Returns the columns that describe the policy and its team."""
-    parts = set(names_of(observation))
-    return {
-        "policy": name,
-        "estimator": estimator or ("known_model" if OF_BELIEF & parts else "none"),
-        "robots": robots,
-        "team": "shared" if robots > 1 and OF_TEAM & parts else "alone",
-    }
+        fingerprint = _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))
+    else:
+        fingerprint = served.worlds_fingerprint or ""
+    return _Setting(env, keywords, n_robots, wrap, fingerprint)
 
 
 def _play(
     setting: _Setting,
     actor: Actor,
     seeds: Sequence[int],
-    common: dict[str, Any],
+    columns: dict[str, Any],
     report: Progress,
 ) -> list[Row]:
     """Scores a policy on the worlds of some seeds, all at the same time."""
-    steps = common["steps"]
+    steps = columns["steps"]
     with setting.made(len(seeds)) as (worlds, wrapped):
         shown = worlds if wrapped is None else wrapped
-        tally = Tally(worlds.world_spec, len(seeds), common["recent_steps"])
+        tally = Tally(worlds.world_spec, len(seeds), columns["recent_steps"])
         actor.begin(len(seeds), worlds.num_envs)
         seen, _ = shown.reset(seed=np.repeat(seeds, setting.n_robots).tolist())
-        fingerprint = worlds.lease.client.info.worlds_fingerprint or ""
-        if fingerprint != common["worlds_fingerprint"]:
+        if (worlds.lease.client.info.worlds_fingerprint or "") != setting.fingerprint:
             raise InvalidArgumentError(
                 "worlds: changed since the evaluation began; either the file of their task, model "
                 "or states has changed, or another server uses the instance"
@@ -243,7 +239,7 @@ def _play(
             paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
             tally.add(worlds.results, paths, worlds.truths)
             report.add(len(seeds))
-    return tally.rows(seeds, common)
+    return tally.rows(seeds, columns)
 
 
 def _saved(file: RowFile, rows: Sequence[Row], n_worlds: int) -> tuple[str, str]:

@@ -49,7 +49,7 @@ class RowFile:
             return []
         with self._problems():
             rows = read(self.path)
-            if not self.path.read_text("utf-8-sig").startswith(HEADER):
+            if self.path.read_text("utf-8-sig").splitlines()[:1] not in ([], [HEADER]):
                 raise invalid("csv", f"{self.path} to have the columns {HEADER}", "others")
         names = {row.policy for row in rows}
         if policy in names:
@@ -105,7 +105,7 @@ class RowFile:
         try:
             yield
         except OSError as error:
-            got = f"{self.path}: {error.strerror or error}"
+            got = f"{self.path}: {error}"
             raise invalid("csv", "a file that can be written", got) from None
 
 

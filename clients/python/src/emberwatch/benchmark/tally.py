@@ -57,12 +57,12 @@ class Tally:
             states=None if truths is None or not self._knows_target else truths[:: self.n_robots],
         )
 
-    def rows(self, seeds: Sequence[int], common: dict[str, Any]) -> list[Row]:
-        """Returns the row of each world; `common`: the columns that are equal in all rows."""
-        steps = common["steps"]
+    def rows(self, seeds: Sequence[int], columns: dict[str, Any]) -> list[Row]:
+        """Returns the row of each world; `columns`: values that are equal in all rows."""
+        steps = columns["steps"]
         return [
             Row(
-                **common,
+                **columns,
                 world_seed=seed,
                 mean_reward=float(self.reward[index]) / steps,
                 mean_distinct_cells=int(self.n_visited[index]) / steps,
