@@ -125,9 +125,8 @@ def evaluate(
         "recent_steps": recent_steps,
         "worlds_fingerprint": setting.fingerprint,
     }
-    file = None if csv is None else RowFile(csv, append=append)
-    if file is not None:
-        file.check(name, {(setting.fingerprint, seed, steps) for seed in chosen})
+    played = {(setting.fingerprint, seed, steps) for seed in chosen}
+    file = None if csv is None else RowFile(csv, append=append, policy=name, worlds=played)
     report = Progress(progress, name, chosen, steps)
     rows: list[Row] = []
     try:

@@ -30,8 +30,7 @@ class Progress:
         if self._out is not None and self._out.isatty() and now - self._last > 1.0:
             self._last = now
             left = (now - self._begin) * (self._n_steps / self._n_done - 1.0)
-            share = 100 * self._n_done // self._n_steps
-            print(f"\r{self._title}, {share} %, {left:.0f} s left ", end="", file=self._out)
+            print(f"\r{self._title}, {left:.0f} s left ", end="", file=self._out)
 
     def end(self, words: str = "") -> None:
         """Prints the time that the evaluation took, and possibly why it ended early."""
