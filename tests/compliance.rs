@@ -199,8 +199,8 @@ fn a_handshake_tells_everything_a_client_needs(client: Client) {
 
 fn a_step_of_wrong_numbers_is_refused_and_changes_nothing(client: Client) {
     let steps = Table::lay(client);
-    steps.check(|h| h.version = 1, VersionMismatch, 2);
-    steps.check(|h| h.version = 0, VersionMismatch, 2);
+    steps.check(|h| h.version = 2, VersionMismatch, 3);
+    steps.check(|h| h.version = 0, VersionMismatch, 3);
     steps.check(|h| h.operation = 0, UnknownOperation, 0);
     steps.check(|h| h.operation = 4, UnknownOperation, 4);
     for (first, n_robots) in [(0, 0), (6, 1), (0, 7), (5, 2), (u32::MAX, 1), (1, u32::MAX)] {
@@ -278,7 +278,7 @@ null => Malformed 0 malformed control message
 {"op":"renew"} => Malformed 0 lease
 {"op":"renew","lease":-1} => Malformed 0 -1
 {"op":"renew","lease":1,"more":2} => Malformed 0 more
-{"op":"hello","protocol":1,"client":""} => VersionMismatch 2 version mismatch
+{"op":"hello","protocol":2,"client":""} => VersionMismatch 3 version mismatch
 {"op":"acquire","first_robot":0,"n_robots":0} => NoSuchRobot 6 robots 0 to 5
 {"op":"acquire","first_robot":6,"n_robots":1} => NoSuchRobot 6 robots 0 to 5
 {"op":"acquire","first_robot":0,"n_robots":7} => NoSuchRobot 6 robots 0 to 5
@@ -323,7 +323,7 @@ fn a_control_request_is_refused_for_one_reason_and_changes_nothing(client: Clien
 fn another_version_is_refused_with_both_versions_and_what_to_do(client: Client) {
     let server = Server::start(SMALL);
     let wire = client.open(&server.instance);
-    for version in [0, 1, u32::MAX] {
+    for version in [0, 2, u32::MAX] {
         let header = ControlRequest {
             version,
             ..control_header(5)
@@ -331,7 +331,7 @@ fn another_version_is_refused_with_both_versions_and_what_to_do(client: Client) 
         let (reply, payload) = wire.control(header, br#"{"op":"status"}"#);
         assert_eq!(reply.status, VersionMismatch as u32);
         let text = String::from_utf8(payload).expect("text");
-        let has_advice = text.contains("the server 2") && text.contains("the same release");
+        let has_advice = text.contains("the server 3") && text.contains("the same release");
         assert!(has_advice, "{text}");
     }
     assert_eq!(server.status().n_refused, 3);

@@ -289,7 +289,7 @@ fn messages_of_any_length_get_short_replies() {
     let mut texts = Vec::from(
         [
             (
-                r#"{"op":"hello","protocol":2,"client":""#,
+                r#"{"op":"hello","protocol":3,"client":""#,
                 "x",
                 end,
                 Status::Ok,

@@ -77,14 +77,14 @@ fn clients_learn_of_a_killed_server_and_the_next_takes_its_place() {
 fn a_server_of_another_version_is_called_so() {
     let instance = new_instance();
     let node = create_node().expect("a node");
-    let name = format!("emberwatch/v3/{}/control", instance.name());
+    let name = format!("emberwatch/v2/{}/control", instance.name());
     let name = ServiceName::new(&name).expect("a name");
     let service = node.service_builder(&name).request_response::<[u8], [u8]>();
-    let service = service.create().expect("a service of the next version");
+    let service = service.create().expect("a service of the last version");
     let refused = Connection::open(&instance, "test", PATIENCE).map(drop);
     let words = refused.expect_err("another version").to_string();
     assert!(
-        words.contains("the client speaks 2, the server 3;"),
+        words.contains("the client speaks 3, the server 2;"),
         "{words}"
     );
     let other = Connection::open(&new_instance(), "test", PATIENCE).map(drop);

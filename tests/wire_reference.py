@@ -26,7 +26,7 @@ from typing import Any
 
 import iceoryx2 as iox2
 
-VERSION = 2
+VERSION = 3
 
 #: Maximum number of nodes, listeners and notifiers per service.
 MAX_NODES = 64
@@ -71,7 +71,7 @@ def header_type(name: str) -> Any:
     layout, names = LAYOUTS[name]
     kinds = {"I": ctypes.c_uint32, "Q": ctypes.c_uint64}
     fields = [(field, kinds[it]) for field, it in zip(names.split(), layout[1:], strict=True)]
-    type_name = staticmethod(lambda: f"emberwatch.v2.{name}")
+    type_name = staticmethod(lambda: f"emberwatch.v3.{name}")
     return type(name, (ctypes.Structure,), {"_fields_": fields, "type_name": type_name})
 
 

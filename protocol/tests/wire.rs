@@ -157,7 +157,7 @@ fn every_limit_and_every_service_is_documented() {
         Channel::WakeClient,
     ];
     let names = known.map(|channel| service_name(&instance, channel).to_string());
-    let known = names.map(|name| name.replace("emberwatch/v2/x/", ""));
+    let known = names.map(|name| name.replace("emberwatch/v3/x/", ""));
     assert_eq!(documented, BTreeSet::from(known));
 }
 
@@ -205,12 +205,11 @@ fn a_recording_is_laid_out_as_documented() {
     assert_eq!(numbers_under("| record kind | code |"), known);
     for sentence in [
         format!("`{}` in ASCII", recording::MAGIC.escape_ascii()),
-        format!("{}; refuse any other", recording::VERSION),
         format!(
-            "version {1} instead of {0}",
-            recording::VERSION,
-            recording::VERSION.swap_bytes()
+            "{VERSION} or {}; refuse any other",
+            recording::VERSIONS.start()
         ),
+        format!("version {} instead of {VERSION}", VERSION.swap_bytes()),
         format!("has {} bytes, struct `=QIIII`", size_of::<RecordHeader>()),
         format!("stored, at most {MAX_STORED_BYTES} |"),
         format!("of at most {MAX_BODY_BYTES} bytes"),

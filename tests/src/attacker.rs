@@ -16,7 +16,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 /// One control request of each kind. Shutdown, takeovers and file requests are excluded, because any client may use
 /// these.
 const TEMPLATES: [&str; 8] = [
-    r#"{"op":"hello","protocol":2,"client":"x"}"#,
+    r#"{"op":"hello","protocol":3,"client":"x"}"#,
     r#"{"op":"acquire","first_robot":1,"n_robots":1}"#,
     r#"{"op":"acquire","first_robot":0,"n_robots":2,"ttl_millis":100}"#,
     r#"{"op":"renew","lease":LEASE}"#,

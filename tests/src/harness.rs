@@ -183,7 +183,7 @@ pub fn new_instance() -> Instance {
 
 /// Returns the description of a server with one world of 2 x 3 cells, to be stored in a recording.
 pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
-    let text = r#"{"protocol":2,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":0,"n_worlds":1,"n_robots":0,
+    let text = r#"{"protocol":3,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":0,"n_worlds":1,"n_robots":0,
         "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
         "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
     let info = serde_json::from_str(text).expect("what a server says");
@@ -198,7 +198,7 @@ pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
 pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
     let files = std::fs::read_dir(channel_directory().join("services"));
     let files = files.expect("services").flatten().map(|entry| entry.path());
-    let name = format!("emberwatch/v2/{}/", instance.name());
+    let name = format!("emberwatch/v3/{}/", instance.name());
     let text = |path: &PathBuf| std::fs::read_to_string(path).unwrap_or_default();
     files.filter(|path| text(path).contains(&name)).collect()
 }

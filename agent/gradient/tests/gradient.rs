@@ -155,7 +155,6 @@ fn check_all_gradients(sees_own_state: bool) {
             n_observations,
             kernel,
             sees_own_state,
-            n_matrices: 1,
         };
         check_gradients(dimensions, shape, from_belief);
     }
@@ -179,7 +178,6 @@ fn a_window_ends_with_the_filters_prediction() {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
-        n_matrices: 1,
     };
     for tables in [
         Parameters::first(dimensions(false), 2).tables(),

@@ -23,7 +23,6 @@ fn parameters(sees_own_state: bool) -> Parameters {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
-        n_matrices: 1,
     };
     Parameters::first(dimensions, 0)
 }

@@ -17,10 +17,10 @@ const KEPT: f64 = 0.9995;
 const RIDGE: f64 = 1.0;
 
 /// Returns the expected number of visited cells in each state, under the posterior after the path's frame.
-pub fn met(posterior: &Belief, visited: impl Iterator<Item = usize> + Clone) -> Vec<f64> {
+pub fn met(posterior: &Belief, visited: &[usize]) -> Vec<f64> {
     let n_cells = posterior.shape().n_cells();
     let planes = posterior.as_slice().chunks_exact(n_cells);
-    let cells = |plane: &[f32]| visited.clone().map(|cell| f64::from(plane[cell])).sum();
+    let cells = |plane: &[f32]| visited.iter().map(|&cell| f64::from(plane[cell])).sum();
     planes.map(cells).collect()
 }
 

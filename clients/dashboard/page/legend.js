@@ -14,7 +14,7 @@ export function createLegend(list, ramps) {
   return {
     draw(picture, palette) {
       const states = stateNames(picture);
-      const observations = observationNames(picture).slice(0, picture.info.n_named);
+      const observations = observationNames(picture);
       const believed = beliefNames(picture).length;
       const { theme } = palette;
       const { state_colours: ofStates, observation_colours: ofObservations, zones, zone_colours: ofZones } = picture.info;

@@ -58,15 +58,13 @@ const ZONE_SHARE = 0.4;
  * `value * 256 + age`, `rampTable(name)` by 0..255. For cells not observed: `unseenZones` and `zoneTable`, by zone.
  */
 export function paletteOf(picture, theme) {
-  const { state_colours: states, observation_colours: observations, n_named: named, zone_colours: zones } = picture.info ?? {};
-  return remembered([theme, states, observations, named, zones], () => make({ states, observations, named, zones, theme }));
+  const { state_colours: states, observation_colours: observations, zone_colours: zones } = picture.info ?? {};
+  return remembered([theme, states, observations, zones], () => make({ states, observations, zones, theme }));
 }
 
-function make({ states: ownStates, observations: ownObservations, named, zones, theme }) {
+function make({ states: ownStates, observations: ownObservations, zones, theme }) {
   const states = colorsOf(ownStates);
-  const colors = colorsOf(ownObservations);
-  // Observations of a sensor's outer rings have the colours of the first ring.
-  const observations = colors.map((color, at) => colors[at % (named || colors.length)]);
+  const observations = colorsOf(ownObservations);
   const unseen = unlike([...(ownStates ?? COLORS), ...(ownObservations ?? [])], UNSEEN[theme]);
   const value = (colors) => (at) => channels(at === NEVER ? unseen : colors[at]);
   const seen = value(observations);

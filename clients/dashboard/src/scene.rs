@@ -69,9 +69,6 @@ pub struct Info {
     target_state: Option<usize>,
     observations: Vec<String>,
     observation_colours: Option<Vec<String>>,
-    /// Number of observation values for cells on the path. The values for each outer ring come after these, in the same
-    /// colours.
-    n_named: usize,
     /// Number of rows and columns that robots see beyond their path.
     radius: usize,
     zones: Option<Vec<String>>,
@@ -140,7 +137,6 @@ impl Info {
         let zones = info.zones.as_ref();
         let zone_map = zones.and_then(|zones| zones.zone_map(info.shape().ok()?).ok());
         let zones = zones.filter(|_| zone_map.is_some());
-        let n_rings = airspace.as_ref().map_or(1, Airspace::n_rings);
         let colours = file.map(|file| file.observations.iter().map(|one| one.color.clone()));
         Self {
             pid: info.pid,
@@ -154,8 +150,7 @@ impl Info {
             state_colours: names(|state| &state.color),
             target_state: model.as_ref().map(Model::target_state),
             observations: info.observations.clone(),
-            observation_colours: colours.map(|all| all.cycle().take(info.n_observations).collect()),
-            n_named: info.n_observations / n_rings,
+            observation_colours: colours.map(Iterator::collect),
             radius: airspace.as_ref().map_or(0, Airspace::radius),
             zones: zones.map(|zones| zones.names.clone()),
             zone_colours: zones.map(|zones| zones.colors.clone()),

@@ -10,8 +10,8 @@ mod player;
 /// Returns the description of a server with a 2 x 3 world. `keys` replace keys of the description.
 fn server_info(keys: Value) -> ServerInfo {
     let mut info = json!({
-        "protocol": 2, "build": "0.1.0", "pid": 1, "height": 2, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 1,
-        "n_observations": 4, "observations": ["calm", "fire", "calm ring 1", "fire ring 1"], "model": null,
+        "protocol": 3, "build": "0.1.0", "pid": 1, "height": 2, "width": 3, "n_moves": 1, "n_worlds": 1, "n_robots": 1,
+        "n_observations": 2, "observations": ["calm", "fire"], "model": null,
         "burn_in": 0, "max_steps": 0, "max_clients": 16, "coverage": "path", "publish_truth": false,
         "lease_millis": 30_000, "deadline_millis": 0,
     });

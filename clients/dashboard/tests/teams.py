@@ -46,7 +46,7 @@ def _server(n_robots: int) -> dict[str, object]:
     counts = {"n_worlds": 1, "n_robots": n_robots, "n_observations": 3, "max_clients": 16}
     times = {"burn_in": 0, "max_steps": 0, "lease_millis": 30_000, "deadline_millis": 50}
     rest = {"observations": names, "model": None, "coverage": "path", "publish_truth": False}
-    return {"protocol": 2, "build": "0.1.0", "pid": 1} | grid | counts | times | rest
+    return {"protocol": 3, "build": "0.1.0", "pid": 1} | grid | counts | times | rest
 
 
 def _frame(step: int, cells: np.ndarray) -> bytes:

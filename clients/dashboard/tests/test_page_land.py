@@ -15,13 +15,12 @@ ZONE_MAP[:, WIDTH // 2 :] = 1
 
 
 def model_of_zones() -> str:
-    """Returns a wildfire model with two zones, no-fly cells, and a sensor with two rings."""
+    """Returns a wildfire model with two zones, no-fly cells, and a sensor with a radius."""
     text = (ROOT / "config/models/wildfire.toml").read_text()
     head, states = text.split("[[states]]", 1)
     states, kernel = states.split("[[kernel]]", 1)
-    rings = "[[0.9, 0.05, 0.05], [0.7, 0.2, 0.1], [0.05, 0.05, 0.9]]"
     maps = f"zone_map = {ZONE_MAP.tolist()}\nno_fly = {NO_FLY.tolist()}\n"
-    sensor = f"[sensor]\nradius = 2\n[[sensor.rings]]\nobserved_as = {rings}\n"
+    sensor = "[sensor]\nradius = 2\n"
     zones = "".join(f'[[zones]]\nname = "{name}"\ncolor = "{ZONES[name]}"\n' for name in ZONES)
     kernels = [
         f"[[kernel]]{kernel}".replace("[[kernel]]", f'[[kernel]]\nzone = "{name}"')
@@ -43,7 +42,6 @@ def test_land_is_drawn_and_told(programs, open_page, tmp_path):
     check_lines(look)
     legend = look.page.locator("#legend").text_content()
     assert "not observedgrasstownno-flypath" in legend
-    assert "ring" not in legend
     look.at("panel-truth").hover(position={"x": 2, "y": 2})
     inspector = look.page.get_by_label("one cell in numbers")
     look.eventually(lambda: "landgrass, no-fly" in inspector.text_content(), "its zone")
@@ -51,16 +49,14 @@ def test_land_is_drawn_and_told(programs, open_page, tmp_path):
 
 
 def check_cells(look, theme: str) -> None:
-    """Checks that rings have the path's colours, and unobserved cells their zone's pale colour."""
+    """Checks that observed cells have their colours, and other cells their zone's pale colour."""
     frame = look.array("frame").reshape(HEIGHT, WIDTH)
     pixels = look.pixels("panel-frame")[..., :3].astype(float)
-    assert set(frame[frame != 255]) & {3, 4, 5}, "observed from the rings"
     colors = [rgb(color) for color in look.picture(".info.observation_colours")]
-    assert len(colors) == 6
-    assert (np.array(colors[:3]) == colors[3:]).all()
+    assert len(colors) == 3
     tints = [0.4 * rgb(color) + 0.6 * rgb(UNSEEN[theme]) for color in ZONES.values()]
     table = np.array([*colors, *tints])
-    expected = table[np.where(frame == 255, len(colors) + ZONE_MAP, np.minimum(frame, 5))]
+    expected = table[np.where(frame == 255, len(colors) + ZONE_MAP, np.minimum(frame, 2))]
     assert np.abs(pixels - expected).max() <= 0.5 + 1e-9
 
 

@@ -2,9 +2,7 @@
 
 use crate::refusal::invalid;
 use emberwatch_model::{Airspace, Shape};
-use emberwatch_model::{
-    CellMap, DescribedState, Description, ObservationEntry, Pays, RingEntry, SensorEntry,
-};
+use emberwatch_model::{CellMap, DescribedState, Description, ObservationEntry, SensorEntry};
 use numpy::PyReadonlyArray2;
 use pyo3::prelude::*;
 use std::sync::Arc;
@@ -13,8 +11,6 @@ use std::sync::Arc;
 #[derive(FromPyObject)]
 pub struct Given<'py> {
     radius: usize,
-    n_rings: usize,
-    pays: String,
     no_fly: Option<PyReadonlyArray2<'py, bool>>,
 }
 
@@ -28,16 +24,14 @@ impl Given<'_> {
             return Err(invalid(py, "airspace: no_fly", expected, got));
         }
         let no_fly = no_fly.map(Arc::new);
-        // The number of rings is 1 here, because paths do not depend on it.
-        Ok(Airspace::new(shape, no_fly, self.radius, 1, self.pays()))
+        Ok(Airspace::new(shape, no_fly, self.radius))
     }
 
     /// Describes worlds whose model is hidden, so that only the number of observed values is known. Treats each value
     /// as a state that the sensor shows without errors.
     pub fn seen(&self, n_observations: usize) -> Description {
-        let n_values = n_observations / self.n_rings.max(1);
         let shown = |value: usize| {
-            (0..n_values)
+            (0..n_observations)
                 .map(|other| f64::from(other == value))
                 .collect()
         };
@@ -58,27 +52,15 @@ impl Given<'_> {
             name: format!("value-{value}"),
             color: color.clone(),
         };
-        let ring = |_| RingEntry {
-            observed_as: (0..n_values).map(shown).collect(),
-        };
         Description {
             name: "hidden".into(),
             step: "unknown".into(),
             no_fly: rows.map(CellMap::Rows),
             sensor: Some(SensorEntry {
                 radius: self.radius,
-                pays: self.pays(),
-                rings: (1..self.n_rings).map(ring).collect(),
             }),
-            states: (0..n_values).map(state).collect(),
-            observations: (0..n_values).map(observation).collect(),
-        }
-    }
-
-    fn pays(&self) -> Pays {
-        match &*self.pays {
-            "seen" => Pays::Seen,
-            _ => Pays::Visited,
+            states: (0..n_observations).map(state).collect(),
+            observations: (0..n_observations).map(observation).collect(),
         }
     }
 }

@@ -6,7 +6,6 @@ use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_model::path::{MAX_MOVES, Move};
 use emberwatch_model::{Airspace, Cell, Shape};
-use emberwatch_model::{Pays, SeenCell};
 use numpy::ndarray::{ArrayView1, ArrayView3, Axis};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
@@ -35,8 +34,8 @@ pub struct Flights {
     /// The Python `Airspace` that this was built from.
     given: Option<Py<PyAny>>,
     n_moves: usize,
-    /// The reward of each hidden state. A cell pays the reward of its state when it is first visited, or when it is
-    /// first seen if the airspace pays for seen cells. `None`: no rewards.
+    /// The reward of each hidden state. A cell pays the reward of its state when it is first visited. `None`: no
+    /// rewards.
     reward: Option<Vec<f64>>,
     cells: Vec<Cell>,
     n_made: Vec<usize>,
@@ -44,10 +43,6 @@ pub struct Flights {
     states: Vec<u8>,
     moves: Vec<u8>,
     paid: Vec<f64>,
-    /// For each cell, whether its reward has been paid.
-    has_paid: Vec<bool>,
-    /// Work space.
-    sight: (Vec<SeenCell>, Vec<u8>),
 }
 
 #[pymethods]
@@ -72,7 +67,7 @@ impl Flights {
             let expected = format!("an integer within 1 to {MAX_MOVES}");
             return Err(invalid(py, "n_moves", expected, n_moves));
         }
-        let n_bytes = n_rows.saturating_mul(3 * shape.n_cells() + n_moves);
+        let n_bytes = n_rows.saturating_mul(2 * shape.n_cells() + n_moves);
         check_memory(py, format_args!("the flights of {n_rows} robots"), n_bytes)?;
         Ok(Self {
             shape,
@@ -86,8 +81,6 @@ impl Flights {
             states: vec![0; n_rows * shape.n_cells()],
             moves: vec![0; n_rows * n_moves],
             paid: vec![0.0; n_rows],
-            has_paid: vec![false; n_rows * shape.n_cells()],
-            sight: Default::default(),
         })
     }
 
@@ -251,7 +244,6 @@ impl Flights {
         for row in (0..begun.len()).filter(|&row| begun[row]) {
             let cells = row * n_cells..(row + 1) * n_cells;
             self.visited[cells.clone()].fill(0);
-            self.has_paid[cells.clone()].fill(false);
             if let Some(states) = states {
                 let own = states.index_axis_move(Axis(0), row);
                 let kept = self.states[cells].iter_mut();
@@ -266,36 +258,12 @@ impl Flights {
         let step = Move::from_low_bits(action.into());
         let cell = self.airspace.after(step, self.cells[row]);
         self.cells[row] = cell;
-        let (first, index) = (row * self.shape.n_cells(), self.shape.index(cell));
-        let is_new = std::mem::replace(&mut self.visited[first + index], 255) == 0;
-        let paid = if is_new { self.pay(first, index) } else { 0.0 };
+        let at = row * self.shape.n_cells() + self.shape.index(cell);
+        let is_new = std::mem::replace(&mut self.visited[at], 255) == 0;
+        let reward = self.reward.as_ref().filter(|_| is_new);
+        let paid = reward.and_then(|reward| reward.get(usize::from(self.states[at])));
+        let paid = paid.copied().unwrap_or_default();
         self.paid[row] += paid;
-        paid
-    }
-
-    /// Returns the reward of a robot's first visit to cell `index`. `first` is the offset of the robot's grid in the
-    /// arrays.
-    fn pay(&mut self, first: usize, index: usize) -> f64 {
-        let Some(reward) = &self.reward else {
-            return 0.0;
-        };
-        let (sight, rings) = &mut self.sight;
-        if self.airspace.pays() == Pays::Seen {
-            self.airspace.see_into(&[index], sight, rings);
-        } else {
-            sight.clear();
-            sight.push(SeenCell {
-                cell: index,
-                ring: 0,
-            });
-        }
-        let mut paid = 0.0;
-        for at in sight.iter().map(|it| first + it.cell) {
-            if !std::mem::replace(&mut self.has_paid[at], true) {
-                let of_state = reward.get(usize::from(self.states[at]));
-                paid += of_state.copied().unwrap_or_default();
-            }
-        }
         paid
     }
 }

@@ -3,7 +3,7 @@
 use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
 use emberwatch_model::task::Task;
-use emberwatch_model::{CellMap, Description, Model, ModelFile, Pays, parse_color};
+use emberwatch_model::{CellMap, Description, Model, ModelFile, parse_color};
 use emberwatch_sim::states_file::StatesFile;
 use numpy::ToPyArray;
 use numpy::ndarray::{Axis, stack};
@@ -103,7 +103,7 @@ fn refused(error: impl ToString) -> PyErr {
 fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>> {
     let file = model.file();
     let states = file.states.iter();
-    let of_rings = (0..model.n_rings()).flat_map(|_| &file.observations);
+    let observations = file.observations.iter();
     let fields = PyDict::new(py);
     fields.set_item("name", model.name())?;
     fields.set_item("state_names", names(py, states.clone().map(|it| &it.name))?)?;
@@ -114,7 +114,7 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
     )?;
     fields.set_item(
         "observation_colors",
-        colors(py, of_rings.map(|it| &it.color))?,
+        colors(py, observations.map(|it| &it.color))?,
     )?;
     fields.set_item("observation_matrix", model.likelihood().to_pyarray(py))?;
     fields.set_item("reward", model.reward().to_pyarray(py))?;
@@ -124,15 +124,8 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
 
 /// Returns the fields of Python's `Airspace`.
 fn airspace<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>> {
-    let sensor = model.file().sensor.clone().unwrap_or_default();
     let fields = PyDict::new(py);
-    fields.set_item("radius", sensor.radius)?;
-    fields.set_item("n_rings", model.n_rings())?;
-    let pays = match sensor.pays {
-        Pays::Visited => "visited",
-        Pays::Seen => "seen",
-    };
-    fields.set_item("pays", pays)?;
+    fields.set_item("radius", model.radius())?;
     let no_fly = model.file().no_fly.as_ref().map(CellMap::grid);
     let no_fly = no_fly.map(|map| map.expect("invariant: a model's maps are checked"));
     let no_fly = no_fly.map(|map| map.mapv(|flag| flag != 0).to_pyarray(py));

@@ -7,9 +7,8 @@ use crate::refusal::invalid;
 use emberwatch_belief::planning::objective::CellValues;
 use emberwatch_belief::planning::{BeamSearch, PlanningProblem};
 use emberwatch_messages::errors::ChannelError;
-use emberwatch_model::Pays;
 use emberwatch_model::path::{MAX_MOVES, path_to_bytes};
-use emberwatch_model::{Airspace, Cell, Grid};
+use emberwatch_model::{Airspace, Cell, Shape};
 use numpy::ndarray::{Array2, ArrayView1};
 use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -46,7 +45,7 @@ pub fn beam_search<'py>(
     };
     // A beam never holds more states than there are paths, 4 to the power of `n_moves`.
     let n_paths = 4_usize.saturating_pow(n_moves as u32);
-    check(py, &airspace, n_moves, (width, width.min(n_paths)))?;
+    check(py, shape, n_moves, (width, width.min(n_paths)))?;
     let mut paths = Array2::zeros((n_worlds, n_moves));
     let mut search = BeamSearch::new(width.min(n_paths));
     let mut looked = Instant::now();
@@ -60,7 +59,7 @@ pub fn beam_search<'py>(
     let worlds = values.outer_iter().zip(robots.outer_iter()).zip(keys);
     for (((values, robot), &key), mut path) in worlds.zip(paths.outer_iter_mut()) {
         search.set_key(key);
-        let values = values_in(&airspace, values.to_owned());
+        let values = CellValues::new(values.to_owned(), 0.0).within(&airspace, None);
         let start = Cell {
             row: robot[0] as usize,
             col: robot[1] as usize,
@@ -79,19 +78,10 @@ pub fn beam_search<'py>(
     Ok(paths.into_pyarray(py))
 }
 
-/// Returns the values of cells for the search. A path collects the values of its own cells, or of all cells in sight of
-/// it if the airspace pays for seen cells.
-fn values_in(airspace: &Airspace, values: Grid<f32>) -> CellValues {
-    match airspace.pays() {
-        Pays::Seen => CellValues::in_sight_of(airspace, values),
-        Pays::Visited => CellValues::new(values, 0.0).within(airspace, None),
-    }
-}
-
 /// Checks that the arguments are in range, and that the beam's memory is within the limit and available.
 fn check(
     py: Python<'_>,
-    airspace: &Airspace,
+    shape: Shape,
     n_moves: usize,
     (width, n_kept): (usize, usize),
 ) -> PyResult<()> {
@@ -99,15 +89,10 @@ fn check(
     if !(1..=MAX_MOVES).contains(&n_moves) {
         return Err(invalid(py, "n_moves", within(MAX_MOVES), n_moves));
     }
-    let (height, n_cols) = airspace.shape().dim();
-    let reach = |side: usize, radius: usize| side.min(2 * (n_moves + radius) + 1);
-    let set_bytes = |radius| (reach(height, radius) * reach(n_cols, radius)).div_ceil(64) * 8;
-    let sight_bytes = match airspace.pays() {
-        Pays::Visited => 0,
-        Pays::Seen => set_bytes(airspace.radius()),
-    };
+    let reach = |side: usize| side.min(2 * n_moves + 1);
+    let set_bytes = (reach(shape.height()) * reach(shape.width())).div_ceil(64) * 8;
     // Each state has two sets of cells, for before and after a move, and one link per move to the previous state.
-    let state_bytes = 2 * (set_bytes(0) + sight_bytes) + n_moves * 8;
+    let state_bytes = 2 * set_bytes + n_moves * 8;
     let widest = MAX_WIDTH.min(MAX_BYTES / state_bytes);
     if !(1..=widest).contains(&width) {
         return Err(invalid(py, "width", within(widest), width));

@@ -5,7 +5,7 @@ use crate::errors::check_memory;
 use crate::flights::Flights;
 use crate::model::shape_of;
 use crate::refusal::invalid;
-use emberwatch_model::{Airspace, Cell, Pays, Shape};
+use emberwatch_model::{Airspace, Cell, Shape};
 use numpy::{PyArray1, PyArray4, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray4};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -25,8 +25,6 @@ pub struct Windows {
     side: usize,
     n_channels: usize,
     n_rows: usize,
-    /// Radius, in rows and columns, of the square of cells whose rewards are paid when a robot visits a cell.
-    reach: usize,
     maps: Vec<u8>,
     /// The Python `Airspace` that this was built from.
     given: Py<PyAny>,
@@ -55,10 +53,6 @@ impl Windows {
             side,
             n_channels,
             n_rows,
-            reach: match airspace.pays() {
-                Pays::Seen => airspace.radius(),
-                Pays::Visited => 0,
-            },
             maps: vec![0; n_bytes],
             given,
         };
@@ -106,25 +100,18 @@ impl Windows {
         Ok(())
     }
 
-    /// Updates the maps of the rows marked in `moved`: marks each robot's cell as visited, and clears the world
-    /// channels of all cells whose reward has been paid, because no reward remains there.
+    /// Updates the maps of the rows marked in `moved`: marks each robot's cell as visited, and clears its world
+    /// channels, because no reward remains there.
     fn visit(&mut self, flights: &Flights, moved: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let moved = moved.as_array();
         if moved.len() != self.n_rows || flights.cells().len() != self.n_rows {
             return Err(PyValueError::new_err("visit: expected one flag per row"));
         }
-        let (height, width) = self.shape.dim();
-        let (reach, n_of_world) = (self.reach, self.n_channels - N_OF_PATH);
+        let n_of_world = self.n_channels - N_OF_PATH;
         for row in (0..self.n_rows).filter(|&row| moved[row]) {
-            let at = flights.cells()[row];
-            for y in at.row.saturating_sub(reach)..=(at.row + reach).min(height - 1) {
-                for x in at.col.saturating_sub(reach)..=(at.col + reach).min(width - 1) {
-                    let first = self.index(row, Cell { row: y, col: x });
-                    self.maps[first..][..n_of_world].fill(0);
-                }
-            }
-            let visited = self.index(row, at) + n_of_world;
-            self.maps[visited] = 255;
+            let first = self.index(row, flights.cells()[row]);
+            self.maps[first..][..n_of_world].fill(0);
+            self.maps[first + n_of_world] = 255;
         }
         Ok(())
     }

@@ -7,7 +7,7 @@ LAYOUTS = document.layouts()
 
 def header(name: str, *, result: bytes = bytes(64), **fields: int) -> bytes:
     """Returns the bytes of a header. Fields that are not given are 0."""
-    layout, given = LAYOUTS[name], {"version": 2} | fields
+    layout, given = LAYOUTS[name], {"version": 3} | fields
     assert given.keys() <= {field.name for field in layout.fields}
     return b"".join(
         result

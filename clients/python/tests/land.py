@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 Cells = NDArray[np.bool_]
 
-#: A ring whose observations are exact, and differ from the observations of other rings.
-RING = {"observed_as": np.eye(3).tolist()}
-
 #: Cells of a 7 x 5 grid where no robot may be; the corner (0, 4) is enclosed.
 NO_FLY: Cells = np.array(
     [
@@ -32,15 +29,11 @@ NO_FLY: Cells = np.array(
 def model(
     *,
     radius: int = 0,
-    n_rings: int = 1,
-    pays: str = "visited",
     no_fly: Cells | str | None = None,
     zone_map: NDArray[np.uint8] | str | None = None,
 ) -> str:
     """Returns the text of a model with an exact sensor. Maps may be names of files next to it."""
-    keys = [f'sensor = {{ radius = {radius}, pays = "{pays}", rings = [']
-    keys += [f"{{ observed_as = {RING['observed_as']} }}," for _ in range(1, n_rings)]
-    keys += ["] }"]
+    keys = [f"sensor = {{ radius = {radius} }}"]
     keys += [f"no_fly = {_rows(no_fly)}"] if no_fly is not None else []
     text = Path(LIVELY).read_text()
     for state, old in enumerate(("[0.98, 0.01, 0.01]", "[0.80, 0.15, 0.05]", "[0.01, 0.01, 0.98]")):
@@ -71,18 +64,6 @@ def cells_of(start: Sequence[int], moves: Sequence[int], no_fly: Cells) -> list[
         is_on_grid = 0 <= row < no_fly.shape[0] and 0 <= col < no_fly.shape[1]
         cells.append((row, col) if is_on_grid and not no_fly[row, col] else cells[-1])
     return cells
-
-
-def rings_of(
-    cells: Sequence[tuple[int, int]], shape: tuple[int, int], radius: int, n_rings: int
-) -> dict[tuple[int, int], int]:
-    """Returns the ring (index of the observation matrix) of each cell in sight of `cells`."""
-    seen: dict[tuple[int, int], int] = {}
-    for at in np.ndindex(shape):
-        distance = min(max(abs(at[0] - row), abs(at[1] - col)) for row, col in cells)
-        if distance <= radius:
-            seen[at[0], at[1]] = min(distance, n_rings - 1)
-    return seen
 
 
 def legal_moves(cell: tuple[int, int], no_fly: Cells) -> list[bool]:

@@ -1,5 +1,6 @@
 """The paper's equations in NumPy, with which the tests compare the filter."""
 
+import re
 import tomllib
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ class Parameters(NamedTuple):
     #: ``w[own, to, from, row, col]``: one kernel, or one per state of the cell itself, per zone.
     kernels: Array
     bias: Array
-    #: ``P(observed value | state)``: one row per state; the matrices of all rings side by side.
+    #: ``P(observed value | state)``: one row per state.
     observed: Array
     initial: Array
     #: The zone of each cell, if the model has zones.
@@ -33,17 +34,21 @@ def parameters(text: str) -> Parameters:
         own += n_own * (zones.index(entry["zone"]) if zones else 0)
         weights = entry.get("scale", 1.0) * np.array(entry["weights"], float)
         kernels[own, names.index(entry["to"]), names.index(entry["from"])] = weights
-    rings = file.get("sensor", {}).get("rings", ())
-    matrices = [[state["observed_as"] for state in states], *(it["observed_as"] for it in rings)]
-    observed = [np.array(it, float) / np.sum(it, axis=1, keepdims=True) for it in matrices]
+    observed = np.array([state["observed_as"] for state in states], float)
     initial = np.array([state["initial"] for state in states], float)
     return Parameters(
         kernels,
         np.array([state.get("bias", 0.0) for state in states]),
-        np.concatenate(observed, axis=1),
+        observed / observed.sum(axis=1, keepdims=True),
         initial / initial.sum(),
         np.array(file["zone_map"], np.uint8) if zones else None,
     )
+
+
+def with_fourth_observation(text: str) -> str:
+    """Adds an observation that no state shows to the text of a model with three observations."""
+    text = re.sub(r"(observed_as = \[.*)\]", r"\1, 0.0]", text)
+    return f'{text}\n[[observations]]\nname = "none"\ncolor = "#000000"\n'
 
 
 def phi(model: Parameters, belief: Array) -> Array:

@@ -52,9 +52,8 @@ def seeing(tmp_path: Path) -> Any:
     return written
 
 
-@pytest.mark.parametrize("pays", ["visited", "seen"])
-def test_moves_lead_where_the_server_reports(seeing: Any, pays: str) -> None:
-    keywords = seeing(radius=1, n_rings=2, pays=pays)
+def test_moves_lead_where_the_server_reports(seeing: Any) -> None:
+    keywords = seeing(radius=1)
     paths = make(**keywords, truth=True)
     late, early = (
         make(
@@ -81,7 +80,7 @@ def test_moves_lead_where_the_server_reports(seeing: Any, pays: str) -> None:
             if index < 5:
                 visited = np.argwhere(got[0]["visited"][..., 0]).tolist()
                 assert set(map(tuple, visited)) == set(cells[1 : index + 2])
-                now = set(land.rings_of([cells[index + 1]], SHAPE, pays == "seen", 1)) - paid
+                now = {cells[index + 1]} - paid
                 assert other[1] == sum(truth[at] == 2 for at in now)
                 paid |= now
         for part in ("frame", "robot"):
@@ -90,12 +89,11 @@ def test_moves_lead_where_the_server_reports(seeing: Any, pays: str) -> None:
         truth, cell = expected[4]["truth"], cells[-1]
 
 
-@pytest.mark.parametrize("pays", ["visited", "seen"])
-def test_windows_show_what_can_still_be_found(seeing: Any, pays: str) -> None:
+def test_windows_show_what_can_still_be_found(seeing: Any) -> None:
     parts = {"observation": ("local", "recent", "belief", "robot"), "window": 5}
-    env = make(MOVES, **seeing(radius=1, n_rings=2, pays=pays), **parts)
+    env = make(MOVES, **seeing(radius=1), **parts)
     seen, _ = env.reset(seed=1)
-    assert seen["recent"].shape == (5, 5, 6 + 3)
+    assert seen["recent"].shape == (5, 5, 3 + 3)
     for path in np.array(actions(env, 60)).reshape(10, 6):
         visited: list[tuple[int, int]] = []
         fire = seen["belief"][..., 2]
@@ -103,7 +101,6 @@ def test_windows_show_what_can_still_be_found(seeing: Any, pays: str) -> None:
             seen = env.step(move)[0]
             row, col = seen["robot"].tolist()
             visited.append((row, col))
-            found = land.rings_of(visited, SHAPE, pays == "seen", 1)
             for at in product(range(5), repeat=2):
                 cell = row + at[0] - 2, col + at[1] - 2
                 is_on_grid = 0 <= cell[0] < 7 and 0 <= cell[1] < 5
@@ -112,13 +109,13 @@ def test_windows_show_what_can_still_be_found(seeing: Any, pays: str) -> None:
                     assert flown == 255 * (cell in visited)
                     assert off == 255 * (not is_on_grid or land.NO_FLY[cell])
                 if is_on_grid:
-                    assert seen["local"][at][0] == (0 if cell in found else fire[cell])
+                    assert seen["local"][at][0] == (0 if cell in visited else fire[cell])
         seen = env.step(path[-1])[0]
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
 def test_airspace_passes_the_checker_and_equals_a_servers(seeing: Any, name: str) -> None:
-    keywords = seeing(radius=2, n_rings=2, pays="seen", zone_map=np.eye(*SHAPE, dtype=np.uint8))
+    keywords = seeing(radius=2, zone_map=np.eye(*SHAPE, dtype=np.uint8))
     parts = ALL_MOVES if name == MOVES else ("frame", "image", "robot", "age", "belief")
     here = make(name, **keywords, observation=parts)
     check_env(make(name, **keywords).unwrapped, skip_render_check=True)
@@ -165,25 +162,19 @@ def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
 def test_recorded_worlds_support_sensor_radius(tmp_path: Path) -> None:
     path = tmp_path / "lab.npy"
     np.save(path, np.random.default_rng(1).integers(0, 3, (20, *SHAPE), np.uint8))
-    rings = "rings = [{ observed_as = [[1, 0], [0, 1], [1, 0]] }]"
-    text = f"sensor = {{ radius = 2, {rings} }}\nno_fly = {land.NO_FLY.astype(int).tolist()}\n"
+    text = f"sensor = {{ radius = 2 }}\nno_fly = {land.NO_FLY.astype(int).tolist()}\n"
     path.with_suffix(".toml").write_text(text + RECORDED.read_text())
     of_states = dict.fromkeys(("height", "width", "burn_in", "model"))
     keywords = {**of_states, "states": path, "start": "2,2", "observation": ("image", "recent")}
-    for radius, n_rings in ((None, 2), (0, 1)):
-        env = make(MOVES, **keywords, sensor_radius=radius)
-        spec = env.unwrapped.world_spec
-        assert spec.airspace.n_rings == spec.description.n_rings == n_rings
-        assert env.observation_space["image"].shape == (7, 5, 1 + 2 * n_rings)
-        names = ("cold", "hot", "cold ring 1", "hot ring 1")
-        assert spec.description.observation_names == names[: 2 * n_rings]
+    for radius, expected in ((None, 2), (0, 0)):
+        spec = make(MOVES, **keywords, sensor_radius=radius).unwrapped.world_spec
+        assert spec.airspace.radius == spec.description.sensor_radius == expected
 
 
 def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     zones = np.arange(35, dtype=np.uint8).reshape(SHAPE) & 1
-    keys: dict[str, Any] = {"radius": 3, "n_rings": 2, "pays": "seen"}
-    whole = Model.from_toml(land.model(**keys, no_fly=land.NO_FLY, zone_map=zones))
-    assert (whole.sensor_radius, whole.n_rings, whole.pays) == (3, 2, "seen")
+    whole = Model.from_toml(land.model(radius=3, no_fly=land.NO_FLY, zone_map=zones))
+    assert whole.sensor_radius == 3
     assert whole.no_fly is not None and whole.no_fly.dtype == np.bool_
     assert np.array_equal(whole.no_fly, land.NO_FLY)
     assert whole.zone_map is not None and whole.zone_map.dtype == np.uint8
@@ -191,22 +182,19 @@ def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     assert whole.zone_names == ("land", "sea")
     assert whole.zone_colors == ((1, 2, 3), (4, 5, 6))
     assert whole.kernels.shape == (2, 3, 3, 3, 3) and not whole.sees_own_state
-    assert whole.observation_names == (
-        *("normal", "latent", "fire"),
-        *("normal ring 1", "latent ring 1", "fire ring 1"),
-    )
-    assert whole.observation_colors == 2 * whole.state_colors
+    assert whole.observation_names == ("normal", "latent", "fire")
+    assert whole.observation_colors == whole.state_colors
     expected = oracle.parameters(whole.toml)
     assert np.array_equal(whole.kernels, expected.kernels)
     assert np.array_equal(whole.observation_matrix, expected.observed)
     # Maps in files next to the model file equal maps in it.
     path = tmp_path / "model.toml"
-    path.write_text(land.model(**keys, no_fly="no_fly.npy", zone_map="zones.npy"))
+    path.write_text(land.model(radius=3, no_fly="no_fly.npy", zone_map="zones.npy"))
     np.save(tmp_path / "no_fly.npy", land.NO_FLY)
     np.save(tmp_path / "zones.npy", zones)
     beside = Model.named(path)
     assert beside == whole == Model.from_toml(beside.toml) == copy.deepcopy(whole)
-    assert whole != Model.from_toml(land.model(**keys, zone_map=zones))
+    assert whole != Model.from_toml(land.model(radius=3, zone_map=zones))
     with refuses("emberwatch-server --check"):
         Model.from_toml(path.read_text())
     (tmp_path / "zones.npy").unlink()
@@ -215,7 +203,6 @@ def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     plain = Model.wildfire()
     assert (plain.airspace, plain.zone_map, plain.zone_names) == (Airspace(), None, ())
     assert plain.with_radius(0) is plain
-    assert (whole.with_radius(1).n_rings, whole.with_radius(0).n_rings) == (2, 1)
     assert whole.with_radius(1).with_radius(3) == whole
     with refuses("radius: expected an integer within 0 to 8, got 9"):
         plain.with_radius(9)
@@ -223,16 +210,16 @@ def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     assert described.with_radius(4).airspace == Airspace(radius=4)
 
 
-def test_the_filter_uses_zones_and_rings() -> None:
+def test_the_filter_uses_zones() -> None:
     rng = np.random.default_rng(2)
     zones = rng.integers(0, 2, SHAPE, np.uint8)
-    text = land.model(radius=2, n_rings=2, zone_map=zones)
+    text = land.model(radius=2, zone_map=zones)
     model, expected = Model.from_toml(text), oracle.parameters(text)
     belief = np.moveaxis(rng.dirichlet(np.ones(3), SHAPE), -1, 0)
     phi = Transition(model, height=7, width=5).apply(belief)
     np.testing.assert_allclose(phi, oracle.phi(expected, belief), atol=1e-12)
     assert np.allclose(phi[:, zones == 1], belief[:, zones == 1])
-    frame = rng.choice(np.array([*range(6), 255], np.uint8), SHAPE)
+    frame = rng.choice(np.array([*range(3), 255], np.uint8), SHAPE)
     kept = known(model, prior=belief)
     kept.correct(frame)
     np.testing.assert_allclose(kept.belief, oracle.bayes(expected, belief, frame), atol=1e-6)
@@ -243,26 +230,21 @@ def test_the_filter_uses_zones_and_rings() -> None:
 
 def test_beam_search_respects_the_airspace() -> None:
     values, robots = np.random.default_rng(4).random((2, *SHAPE)), np.array([(2, 2), (0, 4)])
-    for airspace in (Airspace(no_fly=land.NO_FLY, radius=1, pays=it) for it in ("visited", "seen")):
-        rng = np.random.default_rng(4)
-        paths = beam_search(values, robots, 5, rng=rng, width=4**5, airspace=airspace)
-        reach = 1 if airspace.pays == "seen" else 0
+    rng, airspace = np.random.default_rng(4), Airspace(no_fly=land.NO_FLY, radius=1)
+    paths = beam_search(values, robots, 5, rng=rng, width=4**5, airspace=airspace)
 
-        def worth(path: Any, reach: int = reach) -> float:
-            cells = land.cells_of((2, 2), path, land.NO_FLY)[1:]
-            return sum(values[0][at] for at in land.rings_of(cells, SHAPE, reach, 1))
+    def worth(path: Any) -> float:
+        return sum(values[0][at] for at in set(land.cells_of((2, 2), path, land.NO_FLY)[1:]))
 
-        best = max(worth(every) for every in product(range(4), repeat=5))
-        assert worth(paths[0]) == pytest.approx(best, abs=1e-5)
-        # The other robot is enclosed.
-        assert land.cells_of((0, 4), paths[1], land.NO_FLY)[-1] == (0, 4)
+    best = max(worth(every) for every in product(range(4), repeat=5))
+    assert worth(paths[0]) == pytest.approx(best, abs=1e-5)
+    # The other robot is enclosed.
+    assert land.cells_of((0, 4), paths[1], land.NO_FLY)[-1] == (0, 4)
 
 
 def test_an_invalid_airspace_is_refused() -> None:
     for keywords, words in (
         ({"radius": 9}, "radius: expected an integer within 0 to 8, got 9"),
-        ({"radius": 1, "n_rings": 3}, "n_rings: expected an integer within 1 to 2, got 3"),
-        ({"pays": "both"}, "pays: expected 'visited' or 'seen', got 'both'"),
         ({"no_fly": np.zeros(3, bool)}, r"no_fly: expected .* \(H, W\) and type bool"),
         ({"no_fly": np.zeros((3, 3))}, r"no_fly: expected .* \(H, W\) and type bool"),
     ):

@@ -10,6 +10,7 @@ from typing import Any
 
 import golden_options
 import numpy as np
+import oracle
 import pytest
 from failures import fails, refuses
 from numpy.typing import NDArray
@@ -279,11 +280,10 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
         belief.load(tmp_path / "missing", **GRID)
     with refuses("checkpoint.*of `train --learner neural`, got none|expected a learned neural"):
         belief.load(checkpoints / "learned_filter", **GRID, kind="neural")
-    rings = "[{ observed_as = [[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]] }]"
-    ringed = Model.from_toml(f"{MODEL.toml}\n[sensor]\nradius = 1\nrings = {rings}\n")
+    model = Model.from_toml(oracle.with_fourth_observation(MODEL.toml))
     for name in ("learned_filter", "neural_belief"):
-        with refuses("checkpoint: expected the world's 6 observations, got 3"):
-            belief.load(checkpoints / name, **GRID, model=ringed)
+        with refuses("checkpoint: expected the world's 4 observations, got 3"):
+            belief.load(checkpoints / name, **GRID, model=model)
 
 
 def test_a_neural_belief_can_use_a_known_sensor(checkpoints: Path) -> None:

@@ -15,6 +15,7 @@ import environments
 import golden_options
 import gymnasium
 import numpy as np
+import oracle
 import pytest
 from environments import OBJECTIVE, assert_same, closed_later, rollout
 from failures import fails, refuses
@@ -180,20 +181,13 @@ def test_beliefs_are_published_to_readers() -> None:
         assert eventually(is_shown)
 
 
-def ringed(folder: Path) -> Path:
-    """Makes a model whose sensor has a second ring, and so twice as many observations."""
-    matrix = "[[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]]"
-    sensor = f"\n[sensor]\nradius = 1\nrings = [{{ observed_as = {matrix} }}]\n"
-    model = folder / "ringed.toml"
-    model.write_text(Path(environments.LIVELY).read_text() + sensor)
-    return model
-
-
 def test_a_checkpoint_that_does_not_fit_is_refused(checkpoints: Path, tmp_path: Path) -> None:
+    model = tmp_path / "model.toml"
+    model.write_text(oracle.with_fourth_observation(Path(environments.LIVELY).read_text()))
     for name in ("learned_filter", "neural_belief"):
         for maker in (make, make_vec):
-            with refuses("checkpoint: expected the world's 6 observations, got 3"):
-                maker(checkpoint=checkpoints / name, model=ringed(tmp_path))
+            with refuses("checkpoint: expected the world's 4 observations, got 3"):
+                maker(checkpoint=checkpoints / name, model=model)
     # An estimator that knows the model ignores learned filters.
     known = make(checkpoint=checkpoints / "learned_filter", estimator="known_model")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])

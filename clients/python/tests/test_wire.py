@@ -205,8 +205,6 @@ def test_errors_name_the_python_keyword() -> None:
 NO_LAND: list[tuple[str, Any]] = [
     ("airspace", []),
     *(("airspace", {"radius": it}) for it in (9, None, 1.0)),
-    ("airspace", {"n_rings": 4}),
-    ("airspace", {"pays": "sold"}),
     *(("airspace", {"no_fly": it}) for it in ([[0, 0, 2], [0, 0, 0]], [[0, 0, 1]], "beside.npy")),
     *(("zones", {"names": it}) for it in (["land"], None)),
     ("zones", {"colors": ["#b7a57a", "blue"]}),

@@ -4,7 +4,7 @@ use crate::limits::memory::in_words;
 use thiserror::Error;
 
 /// Version of the protocol.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 
 /// Flag in [`crate::message::StepRequest::flags`]: observe every cell, not only the path. Allowed only if the server's
 /// coverage is `client` or `full`.

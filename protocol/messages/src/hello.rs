@@ -1,7 +1,7 @@
 //! The answer to `hello`: a server's settings, airspace and zones.
 
 use emberwatch_model::grid::{Grid, Shape, ShapeError};
-use emberwatch_model::{Airspace, MAX_RADIUS, Pays, parse_color};
+use emberwatch_model::{Airspace, MAX_RADIUS, parse_color};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -83,16 +83,10 @@ impl ServerInfo {
     /// If the map does not fit the grid, or a number is out of range. The error contains the expected value.
     pub fn airspace(&self) -> Result<Airspace, String> {
         let shape = self.shape().map_err(|error| error.to_string())?;
-        let airspace = self.airspace.as_ref();
-        let n_rings = airspace.map_or(1, |info| info.n_rings.max(1));
-        if !self.n_observations.is_multiple_of(n_rings) {
-            let expected = format!("observations for each of {n_rings} rings");
-            return Err(format!(
-                "airspace: expected {expected}, got {}",
-                self.n_observations
-            ));
+        match &self.airspace {
+            Some(info) => info.airspace(shape),
+            None => Ok(Airspace::open(shape)),
         }
-        airspace.map_or_else(|| Ok(Airspace::open(shape)), |info| info.airspace(shape))
     }
 
     /// Returns the number of steps of the shortest episode, or `None` if episodes are never truncated.
@@ -131,11 +125,6 @@ pub enum CoverageRule {
 pub struct AirspaceInfo {
     /// Number of rows and columns that robots see beyond each cell of their path, 0 to 8.
     pub radius: usize,
-    /// Number of observation matrices: one for the path, and one per ring around it. The last matrix applies to all
-    /// further rings. Observation y of matrix m has the index `m * n_observations / n_rings + y`.
-    pub n_rings: usize,
-    /// Whether visited or seen cells earn rewards.
-    pub pays: Pays,
     /// No-fly map, row by row: 1 for each cell closed to robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<Vec<Vec<u8>>>,
@@ -158,11 +147,10 @@ impl AirspaceInfo {
     /// # Errors
     /// If the map does not fit the grid, or a number is out of range. The error contains the expected value.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, String> {
-        let (radius, n_rings) = (self.radius, self.n_rings);
-        if radius > MAX_RADIUS || !(1..=radius + 1).contains(&n_rings) {
-            let expected = format!("a radius up to {MAX_RADIUS} and 1 to radius + 1 rings");
+        let radius = self.radius;
+        if radius > MAX_RADIUS {
             return Err(format!(
-                "airspace: expected {expected}, got {radius} and {n_rings}"
+                "airspace: expected a radius up to {MAX_RADIUS}, got {radius}"
             ));
         }
         let no_fly = self.no_fly.as_ref();
@@ -170,7 +158,7 @@ impl AirspaceInfo {
             .map(|rows| of_grid("no_fly", shape, rows))
             .transpose()?;
         let no_fly = no_fly.map(|map| Arc::new(map.mapv(|flag| flag != 0)));
-        Ok(Airspace::new(shape, no_fly, radius, n_rings, self.pays))
+        Ok(Airspace::new(shape, no_fly, radius))
     }
 }
 

@@ -21,7 +21,7 @@ pub trait Header: std::fmt::Debug + Default + Pod + Send + Sync {
 macro_rules! headers {
     ($($header:ident),* $(,)?) => {$(
         impl Header for $header {
-            const TYPE_NAME: &'static str = concat!("emberwatch.v2.", stringify!($header));
+            const TYPE_NAME: &'static str = concat!("emberwatch.v3.", stringify!($header));
         }
     )*};
 }
@@ -108,7 +108,7 @@ pub struct WorldResult {
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of the rewards of the distinct cells that any robot visited (or saw, if the model pays for seen cells), each
+    /// Sum of the rewards of the distinct cells that any robot visited, each
     /// in its state in `X_{k+1}`.
     pub reward: f64,
     /// Bit r is set if no client held robot r of the world. A robot that nobody holds stays in its cell and sees
@@ -133,7 +133,7 @@ pub struct WorldResult {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct RobotResult {
-    /// The robot's share of the team's reward: a cell that v robots visited (or saw) pays 1/v of its reward to each.
+    /// The robot's share of the team's reward: a cell that v robots visited pays 1/v of its reward to each.
     pub reward: f64,
     /// The robot's marginal contribution: the team's reward minus the team's reward without this robot.
     pub marginal: f64,

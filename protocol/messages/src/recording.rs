@@ -11,7 +11,7 @@ mod writer;
 
 pub use format::{
     Event, FileHeader, Kind, MAGIC, MAX_BODY_BYTES, MAX_STORED_BYTES, Record, RecordHeader,
-    RecordingError, Totals, VERSION,
+    RecordingError, Totals, VERSIONS,
 };
 pub use reader::Reader;
 pub use writer::Writer;

@@ -8,7 +8,7 @@ use emberwatch_messages::control::ServerInfo;
 
 /// Returns the settings of a server with two robots in each world.
 fn server(height: usize, width: usize, n_moves: usize, n_worlds: u32) -> ServerInfo {
-    let text = r#"{"protocol": 2, "build": "0.1.0", "pid": 7, "height": 0, "width": 0, "n_moves": 0, "n_worlds": 0,
+    let text = r#"{"protocol": 3, "build": "0.1.0", "pid": 7, "height": 0, "width": 0, "n_moves": 0, "n_worlds": 0,
         "n_robots": 2, "n_observations": 3, "observations": ["normal", "latent", "fire"], "model": null, "burn_in": 20,
         "max_steps": 0, "max_clients": 16, "coverage": "path", "publish_truth": true, "lease_millis": 30000,
         "deadline_millis": 0, "recorded_world": null, "task": null}"#;

@@ -209,9 +209,9 @@ fn other_files_are_refused_by_what_they_begin_with() {
     // A missing record is detected when the end record is read, because it contains the number of records.
     let without = [&bytes[..places[2]], &bytes[places[3]..]].concat();
     check_refused(&without, "totals: expected");
-    bytes[8..12].copy_from_slice(&2u32.to_be_bytes());
-    check_refused(&bytes, "version: expected 2, got 33554432");
-    bytes[8..16].copy_from_slice(&[2, 0, 0, 0, 2, 0, 0, 0]);
+    bytes[8..12].copy_from_slice(&3u32.to_be_bytes());
+    check_refused(&bytes, "version: expected 2 to 3, got 50331648");
+    bytes[8..16].copy_from_slice(&[3, 0, 0, 0, 2, 0, 0, 0]);
     check_refused(&bytes, "expected 0 in byte 12 to 15, got 2");
 }
 
@@ -287,7 +287,7 @@ fn a_writer_refuses_what_a_reader_would() {
     for (change, words) in changes! { TruthHeader, it:
         { it.payload.pop(); } "expected 6, got 5"
         { it.header.world = 3; } "below 3, got 3"
-        { it.header.version = 9; } "version: expected 2, got 9"
+        { it.header.version = 9; } "version: expected 3, got 9"
     } {
         let mut sample = truth(2, vec![0; 6]);
         change(&mut sample);

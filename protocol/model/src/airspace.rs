@@ -1,6 +1,5 @@
 //! An [`Airspace`]: the cells where robots may fly, and the cells that they see from a path.
 
-use super::file::Pays;
 use super::grid::{Cell, Grid, Shape};
 use super::path::{Flight, Move, fly_by};
 use std::sync::Arc;
@@ -12,48 +11,28 @@ pub struct Airspace {
     /// For each cell, whether it is closed to robots.
     no_fly: Option<Arc<Grid<bool>>>,
     radius: usize,
-    n_rings: usize,
-    pays: Pays,
-}
-
-/// A cell that is seen from a path.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SeenCell {
-    /// The row-major index of the cell.
-    pub cell: usize,
-    /// The index of its observation matrix: the cell's ring around the nearest cell of the path, but at most the last
-    /// ring with a matrix.
-    pub ring: u8,
 }
 
 impl Airspace {
     /// Makes an airspace without no-fly cells, with a sensor that sees only the cells of the path.
     pub fn open(shape: Shape) -> Self {
-        Self::new(shape, None, 0, 1, Pays::Visited)
+        Self::new(shape, None, 0)
     }
 
     /// Makes an airspace that is closed to robots in the cells set in `no_fly` (shape `[H, W]`).
     ///
-    /// The sensor sees `radius` rows and columns beyond each cell of the path, with `n_rings` observation matrices.
-    /// With a radius of 0, a robot sees exactly the cells that it visits.
+    /// The sensor sees `radius` rows and columns beyond each cell of the path. With a radius of 0, a robot sees exactly
+    /// the cells that it visits.
     ///
     /// # Panics
     /// If the shape of `no_fly` is not the grid's.
-    pub fn new(
-        shape: Shape,
-        no_fly: Option<Arc<Grid<bool>>>,
-        radius: usize,
-        n_rings: usize,
-        pays: Pays,
-    ) -> Self {
+    pub fn new(shape: Shape, no_fly: Option<Arc<Grid<bool>>>, radius: usize) -> Self {
         let dim = no_fly.as_ref().map_or(shape.dim(), |map| map.dim());
         assert_eq!(dim, shape.dim(), "no_fly: expected the shape of the grid");
         Self {
             shape,
             no_fly: no_fly.filter(|map| map.iter().any(|closed| *closed)),
             radius,
-            n_rings,
-            pays: if radius == 0 { Pays::Visited } else { pays },
         }
     }
 
@@ -65,16 +44,6 @@ impl Airspace {
     /// Returns the number of rows and columns that the sensor sees beyond each cell of the path, 0 to 8.
     pub fn radius(&self) -> usize {
         self.radius
-    }
-
-    /// Returns the number of observation matrices: one for the path, then one per ring around it.
-    pub fn n_rings(&self) -> usize {
-        self.n_rings
-    }
-
-    /// Returns whether visited or seen cells earn rewards.
-    pub fn pays(&self) -> Pays {
-        self.pays
     }
 
     /// Returns whether robots may fly over every cell of the grid.
@@ -150,18 +119,16 @@ impl Airspace {
         }
     }
 
-    /// Lists every cell that the sensor sees from the visited cells, each once. `visited` contains row-major indices.
-    /// `rings` is a scratch buffer; its content does not matter.
-    pub fn see_into(&self, visited: &[usize], seen: &mut Vec<SeenCell>, rings: &mut Vec<u8>) {
-        const UNSEEN: u8 = u8::MAX;
+    /// Lists every cell that the sensor sees from the visited cells, each once, as row-major indices. `is_seen` is a
+    /// scratch buffer; its content does not matter.
+    pub fn see_into(&self, visited: &[usize], seen: &mut Vec<usize>, is_seen: &mut Vec<bool>) {
         seen.clear();
         if self.radius == 0 {
-            seen.extend(visited.iter().map(|&cell| SeenCell { cell, ring: 0 }));
+            seen.extend(visited);
             return;
         }
-        rings.clear();
-        rings.resize(self.shape.n_cells(), UNSEEN);
-        let last = (self.n_rings - 1) as u8;
+        is_seen.clear();
+        is_seen.resize(self.shape.n_cells(), false);
         let (height, width) = self.shape.dim();
         let within = |at: usize, side: usize| {
             at.saturating_sub(self.radius)..(at + self.radius + 1).min(side)
@@ -169,31 +136,18 @@ impl Airspace {
         for &index in visited {
             let Cell { row, col } = self.shape.cell(index);
             for near_row in within(row, height) {
-                let down = near_row.abs_diff(row);
                 for near_col in within(col, width) {
-                    let ring = (down.max(near_col.abs_diff(col)) as u8).min(last);
                     let cell = near_row * width + near_col;
-                    if rings[cell] == UNSEEN {
-                        seen.push(SeenCell { cell, ring });
+                    if !std::mem::replace(&mut is_seen[cell], true) {
+                        seen.push(cell);
                     }
-                    rings[cell] = rings[cell].min(ring);
                 }
             }
-        }
-        seen.iter_mut().for_each(|it| it.ring = rings[it.cell]);
-    }
-
-    /// Returns the row-major indices of the distinct cells that earn a reward when a path is flown.
-    pub fn paying(&self, start: Cell, path: &[Move]) -> Vec<usize> {
-        let visited = self.fly(start, path).visited;
-        match self.pays {
-            Pays::Visited => visited,
-            Pays::Seen => self.see(&visited).iter().map(|it| it.cell).collect(),
         }
     }
 
     /// Returns the cells that the sensor sees from the visited cells (see [`Self::see_into`]).
-    pub fn see(&self, visited: &[usize]) -> Vec<SeenCell> {
+    pub fn see(&self, visited: &[usize]) -> Vec<usize> {
         let mut seen = Vec::new();
         self.see_into(visited, &mut seen, &mut Vec::new());
         seen

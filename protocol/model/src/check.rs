@@ -6,7 +6,7 @@ use super::file::{
     StateEntry, parse_color,
 };
 use super::grid::Grid;
-use ndarray::{Array1, Array2, Array4, ArrayViewMut1, s};
+use ndarray::{Array1, Array2, Array4};
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
 
@@ -138,59 +138,32 @@ impl Checker<'_> {
         Ok(())
     }
 
-    /// Returns the observation matrices of the path and of each ring, joined along the observations, shape `[S, O]`.
-    pub fn likelihood(&self, file: &ModelFile) -> Result<Array2<f64>, ModelError> {
-        let (n_states, n_named) = (file.states.len(), file.observations.len());
-        let sensor = file.sensor.clone().unwrap_or_default();
-        if sensor.radius > MAX_RADIUS {
-            let expected = format!("0 to {MAX_RADIUS} cells");
-            return self.wrong("sensor: radius".into(), &expected, sensor.radius);
-        }
-        let (n_rings, got) = (1 + sensor.rings.len(), sensor.rings.len());
-        if got > sensor.radius {
-            let expected = format!("at most {} rings, the sensor's radius", sensor.radius);
-            return self.wrong("sensor: rings".into(), &expected, got);
-        }
-        if n_named * n_rings > MAX_VALUES {
-            let expected = format!("at most {MAX_VALUES} observations times observation matrices");
-            return self.wrong("sensor: rings".into(), &expected, n_named * n_rings);
-        }
-        let mut likelihood = Array2::zeros((n_states, n_named * n_rings));
-        for (state, entry) in file.states.iter().enumerate() {
-            let what = format!("state {:?}: observed_as", entry.name);
-            let row = likelihood.slice_mut(s![state, ..n_named]);
-            self.observed_as(what, &entry.observed_as, row)?;
-        }
-        for (index, ring) in sensor.rings.iter().enumerate() {
-            let what = format!("sensor: ring {}: observed_as", index + 1);
-            if ring.observed_as.len() != n_states {
-                let expected = format!("{n_states} rows, one per state");
-                return self.wrong(what, &expected, ring.observed_as.len());
+    /// Checks the radius of the sensor.
+    pub fn radius(&self, file: &ModelFile) -> Result<(), ModelError> {
+        match &file.sensor {
+            Some(sensor) if sensor.radius > MAX_RADIUS => {
+                let expected = format!("0 to {MAX_RADIUS} cells");
+                self.wrong("sensor: radius".into(), &expected, sensor.radius)
             }
-            for (state, values) in ring.observed_as.iter().enumerate() {
-                let what = format!("{what} of state {:?}", file.states[state].name);
-                let columns = (index + 1) * n_named..(index + 2) * n_named;
-                self.observed_as(what, values, likelihood.slice_mut(s![state, columns]))?;
-            }
+            _ => Ok(()),
         }
-        Ok(likelihood)
     }
 
-    /// Writes one state's row of an observation matrix.
-    fn observed_as(
-        &self,
-        what: String,
-        values: &[f64],
-        mut row: ArrayViewMut1<'_, f64>,
-    ) -> Result<(), ModelError> {
-        if values.len() != row.len() {
-            let expected = format!("{} probabilities, one per observation", row.len());
-            return self.wrong(what, &expected, values.len());
+    /// Returns the observation matrix, shape `[S, O]`.
+    pub fn likelihood(&self, file: &ModelFile) -> Result<Array2<f64>, ModelError> {
+        let mut likelihood = Array2::zeros((file.states.len(), file.observations.len()));
+        for (entry, mut row) in file.states.iter().zip(likelihood.rows_mut()) {
+            let what = format!("state {:?}: observed_as", entry.name);
+            let values = &entry.observed_as;
+            if values.len() != row.len() {
+                let expected = format!("{} probabilities, one per observation", row.len());
+                return self.wrong(what, &expected, values.len());
+            }
+            self.distribution(&what, values)?;
+            let sum: f64 = values.iter().sum();
+            row.iter_mut().zip(values).for_each(|(to, p)| *to = p / sum);
         }
-        self.distribution(&what, values)?;
-        let sum: f64 = values.iter().sum();
-        row.iter_mut().zip(values).for_each(|(to, p)| *to = p / sum);
-        Ok(())
+        Ok(likelihood)
     }
 
     /// Returns the zone of each cell, if there are zones.

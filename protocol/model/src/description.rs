@@ -82,9 +82,7 @@ impl Description {
     /// # Errors
     /// If the text is not a valid description, or an entry is wrong.
     pub fn model_of(text: &str) -> Result<Model, ModelError> {
-        let description: Self =
-            toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;
-        description.unchanging()
+        toml::from_str::<Self>(text)?.unchanging()
     }
 }
 

@@ -91,32 +91,6 @@ pub struct SensorEntry {
     /// Number of rows and columns that the sensor sees beyond each cell of the path (a Chebyshev distance).
     #[serde(default)]
     pub radius: usize,
-    /// The cells that earn a reward.
-    #[serde(default)]
-    pub pays: Pays,
-    /// The observation matrices of rings 1, 2 and so on. The last matrix applies to all further rings. Without rings,
-    /// `observed_as` of the states applies everywhere.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub rings: Vec<RingEntry>,
-}
-
-/// The observation matrix of a ring.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RingEntry {
-    /// `P(y | x)`: one row per state, one entry per observation.
-    pub observed_as: Vec<Vec<f64>>,
-}
-
-/// The cells that earn the reward of their state. Each cell counts once.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Pays {
-    /// Cells on the path.
-    #[default]
-    Visited,
-    /// Cells that are seen from the path.
-    Seen,
 }
 
 /// A kind of land in a model file.
@@ -242,6 +216,21 @@ pub enum ModelError {
     },
 }
 
+impl From<toml::de::Error> for ModelError {
+    /// Adds advice if the text contains a key of earlier releases.
+    fn from(error: toml::de::Error) -> Self {
+        let is_gone =
+            |key: &&str| error.message() == format!("unknown field `{key}`, expected `radius`");
+        let mut text = error.to_string();
+        if let Some(key) = ["rings", "pays"].into_iter().find(is_gone) {
+            text += &format!(
+                "remove `{key}`: a sensor has one observation matrix, and rewards are for visited cells\n"
+            );
+        }
+        Self::Toml(text)
+    }
+}
+
 impl ModelFile {
     /// Reads a model file, and the map files in its folder. [`super::Model::new`] checks the entries.
     ///
@@ -253,8 +242,7 @@ impl ModelFile {
             problem,
         };
         let text = read_text(path).map_err(|error| failed(path, error.to_string()))?;
-        let mut file: Self =
-            toml::from_str(&text).map_err(|error| ModelError::Toml(error.to_string()))?;
+        let mut file: Self = toml::from_str(&text)?;
         for map in [&mut file.zone_map, &mut file.no_fly].into_iter().flatten() {
             let read = map.read_beside(path);
             read.map_err(|(path, problem)| failed(&path, problem))?;

@@ -24,13 +24,13 @@ pub mod transition;
 pub mod vectors;
 pub mod zoned;
 
-pub use airspace::{Airspace, SeenCell};
+pub use airspace::Airspace;
 pub use cell_map::CellMap;
 pub use description::{DescribedState, Description};
 pub use dynamics::Dynamics;
 pub use file::{
     KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES, ModelError, ModelFile,
-    ObservationEntry, Pays, RingEntry, SensorEntry, StateEntry, ZoneEntry, parse_color,
+    ObservationEntry, SensorEntry, StateEntry, ZoneEntry, parse_color,
 };
 pub use frame::{Coverage, Frame, UNOBSERVED};
 pub use grid::{Cell, Grid, Probabilities, Shape};

@@ -7,7 +7,7 @@
 use super::airspace::Airspace;
 use super::built_in::MODELS;
 use super::check::Checker;
-use super::file::{LEAST_SHARE, ModelError, ModelFile};
+use super::file::{LEAST_SHARE, ModelError, ModelFile, SensorEntry};
 use super::grid::{Cell, Grid, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
 use std::path::Path;
@@ -56,8 +56,7 @@ impl Model {
     /// # Errors
     /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn from_toml(text: &str) -> Result<Self, ModelError> {
-        let file = toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;
-        Self::new(file)
+        Self::new(toml::from_str(text)?)
     }
 
     /// Reads and checks a model file, and the map files in its folder.
@@ -77,9 +76,7 @@ impl Model {
         if radius == 0 && file.sensor.is_none() {
             return Self::new(file);
         }
-        let sensor = file.sensor.get_or_insert_default();
-        sensor.radius = radius;
-        sensor.rings.truncate(radius);
+        file.sensor = Some(SensorEntry { radius });
         Self::new(file)
     }
 
@@ -95,6 +92,7 @@ impl Model {
         let reward = check.per_state(&file, "reward", |state| state.reward, f64::NEG_INFINITY)?;
         let initial = check.per_state(&file, "initial", |state| state.initial, 0.0)?;
         check.distribution("initial", initial.as_slice().unwrap_or_default())?;
+        check.radius(&file)?;
         let likelihood = check.likelihood(&file)?;
         let initial = &initial / initial.sum();
         let zone_map = check.zone_map(&file)?.map(Arc::new);
@@ -210,32 +208,15 @@ impl Model {
         self.file.states.len()
     }
 
-    /// Returns the number of observations O: the number in the file times the number of observation matrices.
+    /// Returns the number of observations O.
     pub fn n_observations(&self) -> usize {
-        self.likelihood.ncols()
+        self.file.observations.len()
     }
 
-    /// Returns the number of the sensor's observation matrices: one for the path, and one per ring around it.
-    ///
-    /// The last matrix applies to all further rings up to the radius. Observation `y` of matrix `m` has the index `m *
-    /// O / n_rings + y`.
-    pub fn n_rings(&self) -> usize {
-        1 + self
-            .file
-            .sensor
-            .as_ref()
-            .map_or(0, |sensor| sensor.rings.len())
-    }
-
-    /// Returns the names of the observations. In rings around the path, the name ends with the number of the ring.
+    /// Returns the names of the observations.
     pub fn observation_names(&self) -> Vec<String> {
-        let names = (0..self.n_rings()).flat_map(|ring| {
-            self.file.observations.iter().map(move |it| match ring {
-                0 => it.name.clone(),
-                _ => format!("{} ring {ring}", it.name),
-            })
-        });
-        names.collect()
+        let observations = self.file.observations.iter();
+        observations.map(|it| it.name.clone()).collect()
     }
 
     /// Returns whether a cell's weights depend on its own state.
@@ -264,14 +245,12 @@ impl Model {
     /// If a map does not fit the grid.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, ModelError> {
         self.check_on(shape)?;
-        let sensor = self.file.sensor.clone().unwrap_or_default();
-        Ok(Airspace::new(
-            shape,
-            self.no_fly.clone(),
-            sensor.radius,
-            self.n_rings(),
-            sensor.pays,
-        ))
+        Ok(Airspace::new(shape, self.no_fly.clone(), self.radius()))
+    }
+
+    /// Returns the number of rows and columns that the sensor sees beyond each cell of the path.
+    pub fn radius(&self) -> usize {
+        self.file.sensor.as_ref().map_or(0, |sensor| sensor.radius)
     }
 
     /// Returns the kernels `w[to, from, row, col]`, each of shape `[S, S, KH, KW]`. All weights are `>= 0` (eq. 2).
@@ -297,8 +276,7 @@ impl Model {
         self.edge
     }
 
-    /// Returns `P(y | x)`, shape `[S, O]`: [`Model::n_rings`] matrices side by side. Each row of each matrix sums to
-    /// one (eq. 1).
+    /// Returns `P(y | x)`, shape `[S, O]`. Each row sums to one (eq. 1).
     pub fn likelihood(&self) -> &Array2<f64> {
         &self.likelihood
     }

@@ -1,6 +1,6 @@
 //! The channels of one instance: names, services and limits.
 //!
-//! All channels of an instance are under `emberwatch/v2/<instance>/`. Each user has a separate directory and prefix, so
+//! All channels of an instance are under `emberwatch/v3/<instance>/`. Each user has a separate directory and prefix, so
 //! that users never collide and no stray configuration file is read.
 
 use super::channel_files::other_version;
@@ -110,7 +110,7 @@ impl Channel {
 
 /// Returns the service name of a channel.
 pub fn service_name(instance: &Instance, channel: Channel) -> ServiceName {
-    let name = format!("emberwatch/v2/{}/{}", instance.name(), channel.name());
+    let name = format!("emberwatch/v3/{}/{}", instance.name(), channel.name());
     ServiceName::new(&name).expect("invariant: instance names are short and plain")
 }
 

@@ -76,7 +76,7 @@ fn robots_stay_free(airspace: &Airspace) {
         assert!(airspace.is_free(flight.end));
         let seen = airspace.see(&flight.visited);
         assert!(seen.len() >= flight.visited.len());
-        assert!(seen.iter().all(|seen| seen.cell < shape.n_cells()));
+        assert!(seen.iter().all(|&cell| cell < shape.n_cells()));
     }
 }
 
@@ -112,8 +112,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
     let (kind, contents) = decode(&bytes).expect("read before");
     if let Some(filter) = learned.get::<LearnedModel>() {
         let likelihood = filter.tables.likelihood_array();
-        let n_matrices = filter.tables.dimensions.n_matrices as f64;
-        let sums = likelihood.sum_axis(Axis(1)) / n_matrices;
+        let sums = likelihood.sum_axis(Axis(1));
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
         // Checkpoints of the decisions learner also contain a filter, but a filter learner can resume only from its own
         // checkpoints.
@@ -150,7 +149,6 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 2,
         kernel: (1, 3),
         sees_own_state,
-        n_matrices: 1,
     }
 }
 
@@ -196,15 +194,10 @@ fn dqn() -> Dqn {
 
 pub fn checkpoint_seeds() -> Vec<Seed> {
     let encoded = |kind, contents: Contents| encode(kind, &contents).expect("they serialise");
-    let of_rings = Dimensions {
-        n_matrices: 2,
-        ..dimensions(false)
-    };
     // The large autoencoder claims a size of 30 GiB, but no decoder may allocate so much.
     [
         ("filter", "learned_filter", filter(dimensions(false))),
         ("own_filter", "learned_filter", filter(dimensions(true))),
-        ("filter_of_rings", "learned_filter", filter(of_rings)),
         ("autoencoder", "autoencoder", autoencoder(8, 4)),
         ("autoencoder_large", "autoencoder", autoencoder(4096, 256)),
         ("decisions", "decisions", decisions()),

@@ -34,16 +34,11 @@ impl Innovation {
             _ => 0.0,
         };
         let seen = usize::from(observed);
-        // If a sensor has several observation matrices, `likelihood` contains them side by side. Average only over the
-        // matrix to which this observation belongs.
-        let n_matrices = own[..n_observations].iter().sum::<f64>().round().max(1.0) as usize;
-        let of_matrix = n_observations / n_matrices;
-        let matrix = seen / of_matrix * of_matrix..(seen / of_matrix + 1) * of_matrix;
         let evidence = evidence(seen);
         (evidence > 0.0).then(|| Self {
             evidence,
             value: change(seen, evidence),
-            reduction: matrix.map(reduction).sum(),
+            reduction: (0..n_observations).map(reduction).sum(),
             variance: (before * (1.0 - before)).max(LEAST_VARIANCE),
         })
     }

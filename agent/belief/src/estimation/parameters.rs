@@ -43,10 +43,6 @@ pub struct Dimensions {
     /// In a checkpoint, the shape of a tensor encodes this setting.
     #[serde(skip)]
     pub sees_own_state: bool,
-    /// Number M of observation matrices of the sensor, at least 1. In a checkpoint, the shape of a tensor encodes this
-    /// number.
-    #[serde(skip, default = "one")]
-    pub n_matrices: usize,
 }
 
 /// Three tensors in the order of [`Parameters::NAMES`], which contain unconstrained values, the gradients of these
@@ -54,7 +50,7 @@ pub struct Dimensions {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
-    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, `[S, O]` or `[S, M, O / M]`, and `[S]`, row-major.
+    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, `[S, O]`, and `[S]`, row-major.
     #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
 }
@@ -86,10 +82,6 @@ pub enum DimensionsError {
         "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
     )]
     Kernel { height: usize, width: usize },
-    #[error(
-        "learned filter: observations: expected a multiple of {n_matrices}, the number of matrices, got {got}"
-    )]
-    Matrices { n_matrices: usize, got: usize },
 }
 
 impl Dimensions {
@@ -112,10 +104,6 @@ impl Dimensions {
         if !(is_side(height) && is_side(width)) {
             return Err(DimensionsError::Kernel { height, width });
         }
-        let (n_matrices, got) = (self.n_matrices, self.n_observations);
-        if !got.is_multiple_of(n_matrices) {
-            return Err(DimensionsError::Matrices { n_matrices, got });
-        }
         Ok(self)
     }
 
@@ -126,11 +114,7 @@ impl Dimensions {
         if self.sees_own_state {
             kernel.insert(0, states);
         }
-        let likelihood = match self.n_matrices {
-            1 => vec![states, self.n_observations],
-            n_matrices => vec![states, n_matrices, self.n_of_matrix()],
-        };
-        [kernel, likelihood, vec![states]]
+        [kernel, vec![states, self.n_observations], vec![states]]
     }
 
     /// Returns the number of kernels: S with own-state kernels, otherwise 1.
@@ -140,11 +124,6 @@ impl Dimensions {
         } else {
             1
         }
-    }
-
-    /// Returns the number of observations per observation matrix.
-    pub fn n_of_matrix(&self) -> usize {
-        self.n_observations / self.n_matrices
     }
 
     /// Returns the number of entries of each tensor.
@@ -174,7 +153,7 @@ impl Parameters {
         };
         let logit = |index: usize| {
             let state = index / dimensions.n_observations;
-            let seen = index % dimensions.n_observations % dimensions.n_of_matrix();
+            let seen = index % dimensions.n_observations;
             let own = if state == seen { OWN_OBSERVATION } else { 0.0 };
             own + noise(n_kernel + index)
         };
@@ -212,7 +191,7 @@ impl Parameters {
 
     /// Computes `P(y | x)`, shape `[S, O]`.
     pub fn likelihood(&self) -> Vec<f64> {
-        let rows = self.tensors[1].chunks_exact(self.dimensions.n_of_matrix());
+        let rows = self.tensors[1].chunks_exact(self.dimensions.n_observations);
         rows.flat_map(softmax).collect()
     }
 
@@ -221,10 +200,10 @@ impl Parameters {
         let [kernel, likelihood, initial] = &self.tensors;
         let [by_kernel, by_likelihood, by_initial] = by_tables;
         let slope = |(&free, by): (&f32, &f64)| (by / (1.0 + (-f64::from(free)).exp())) as f32;
-        let n_of_matrix = self.dimensions.n_of_matrix();
+        let n_observations = self.dimensions.n_observations;
         let rows = likelihood
-            .chunks_exact(n_of_matrix)
-            .zip(by_likelihood.chunks_exact(n_of_matrix));
+            .chunks_exact(n_observations)
+            .zip(by_likelihood.chunks_exact(n_observations));
         Self {
             dimensions: self.dimensions,
             tensors: [
@@ -278,7 +257,6 @@ impl Tables {
                 n_observations: model.n_observations(),
                 kernel: (height, width),
                 sees_own_state: model.sees_own_state(),
-                n_matrices: model.n_rings(),
             },
             kernel: model.kernels().iter().flatten().map(cast).collect(),
             likelihood: model.likelihood().iter().map(cast).collect(),
@@ -333,10 +311,6 @@ fn softmax(logits: &[f32]) -> Vec<f64> {
     exponentials.into_iter().map(|x| x / sum).collect()
 }
 
-fn one() -> usize {
-    1
-}
-
 fn softmax_gradient(logits: &[f32], by: &[f64]) -> Vec<f32> {
     let p = softmax(logits);
     let mean: f64 = p.iter().zip(by).map(|(p, by)| p * by).sum();
@@ -354,26 +328,19 @@ mod tests {
             n_observations: 4,
             kernel: (3, 1),
             sees_own_state: false,
-            n_matrices: 1,
         }
     }
 
     #[test]
     fn tables_are_valid_and_gradients_agree_with_differences() {
-        for (n_matrices, n_values) in [(1, 4), (2, 2)] {
-            let dimensions = Dimensions {
-                n_matrices,
-                ..dimensions()
-            };
-            let tables = Parameters::first(dimensions, 7).tables();
-            let rows = tables.likelihood.chunks_exact(n_values);
-            for row in rows.chain([&*tables.initial]) {
-                assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
-            }
-            assert!(tables.kernel.iter().all(|&w| w > 0.0));
-            assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
-            check_chain_rule(dimensions);
+        let tables = Parameters::first(dimensions(), 7).tables();
+        let rows = tables.likelihood.chunks_exact(4);
+        for row in rows.chain([&*tables.initial]) {
+            assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
         }
+        assert!(tables.kernel.iter().all(|&w| w > 0.0));
+        assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
+        check_chain_rule(dimensions());
     }
 
     /// Checks gradients against finite differences.
@@ -412,13 +379,9 @@ mod tests {
     #[test]
     fn dimensions_out_of_range_are_named() {
         type Change = fn(&mut Dimensions);
-        let changes: [(Change, &str); 4] = [
+        let changes: [(Change, &str); 3] = [
             (|it| it.n_states = 1, "states: expected 2 to 64, got 1"),
             (|it| it.n_observations = 65, "got 65"),
-            (
-                |it| it.n_matrices = 3,
-                "a multiple of 3, the number of matrices, got 4",
-            ),
             (|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2"),
         ];
         for (change, words) in changes {

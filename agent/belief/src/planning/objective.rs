@@ -2,9 +2,9 @@
 //! maximise. These values are the costs `c_1` and `c_2` of paper eqs. 13 and 14 with the opposite sign.
 
 use crate::estimation::belief::{Belief, EntropyKind};
+use emberwatch_model::Airspace;
 use emberwatch_model::grid::{Cell, Grid, Shape};
 use emberwatch_model::path::Move;
-use emberwatch_model::{Airspace, Pays};
 use ndarray::ArrayView2;
 use serde::{Deserialize, Serialize};
 
@@ -104,8 +104,8 @@ impl Objective {
         self.values_in(belief, &Airspace::open(belief.shape()))
     }
 
-    /// Computes the cells' values under a belief. Entropy counts in all observed cells. The other targets count in the
-    /// cells that the reward counts (see [`Airspace::pays`]).
+    /// Computes the cells' values under a belief. Entropy counts in all observed cells. The other targets count in
+    /// visited cells, as the reward does.
     ///
     /// # Panics
     /// If the airspace has a different grid.
@@ -119,8 +119,7 @@ impl Objective {
             revisits: self.revisits,
             ..CellValues::new(value, self.coverage_bonus)
         };
-        let counts_in_sight = self.target == Target::Entropy || airspace.pays() == Pays::Seen;
-        if counts_in_sight && airspace.radius() > 0 {
+        if self.target == Target::Entropy && airspace.radius() > 0 {
             CellValues::in_sight_of(airspace, values.value + self.coverage_bonus)
         } else {
             values.within(airspace, None)
@@ -232,7 +231,7 @@ impl CellValues {
             let in_sight = in_sight.as_slice_mut();
             let in_sight = in_sight.expect("invariant: grids are row-major");
             let seen = self.airspace.see(visited);
-            seen.iter().for_each(|it| in_sight[it.cell] = 0.0);
+            seen.iter().for_each(|&cell| in_sight[cell] = 0.0);
         }
         left
     }
@@ -274,6 +273,6 @@ impl CellValues {
         let in_sight = in_sight.expect("invariant: grids are row-major");
         let visited = self.airspace.fly(start, moves).visited;
         let seen = self.airspace.see(&visited);
-        seen.iter().map(|it| in_sight[it.cell]).sum()
+        seen.iter().map(|&cell| in_sight[cell]).sum()
     }
 }

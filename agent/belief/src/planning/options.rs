@@ -247,7 +247,7 @@ fn features(
         let cells = outlook.layer(layer).as_slice();
         let cells = cells.expect("invariant: grids are row-major");
         let sum: f32 = if outlook.counts_in_sight(layer) {
-            seen.iter().map(|it| cells[it.cell]).sum()
+            seen.iter().map(|&cell| cells[cell]).sum()
         } else {
             flight.visited.iter().map(|&cell| cells[cell]).sum()
         };

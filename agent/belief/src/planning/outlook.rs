@@ -2,7 +2,6 @@
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use crate::planning::memory::{Memory, Recent};
-use emberwatch_model::Pays;
 use emberwatch_model::{Airspace, Cell, Grid, Shape};
 use ndarray::Zip;
 
@@ -110,7 +109,7 @@ impl Outlook {
             if self.counts_in_sight(layer) {
                 let cells = self.layers[layer as usize].as_slice_mut();
                 let cells = cells.expect("invariant: grids are row-major");
-                seen.iter().for_each(|it| cells[it.cell] = 0.0);
+                seen.iter().for_each(|&cell| cells[cell] = 0.0);
             }
         }
         self.without_visits(visited)
@@ -126,9 +125,7 @@ impl Outlook {
 
     /// Returns whether a layer counts in all cells in sight, not only on the path.
     pub fn counts_in_sight(&self, layer: Layer) -> bool {
-        let pays_in_sight = self.airspace.pays() == Pays::Seen;
-        self.airspace.radius() > 0
-            && (pays_in_sight || matches!(layer, Layer::Entropy | Layer::Novelty))
+        self.airspace.radius() > 0 && matches!(layer, Layer::Entropy | Layer::Novelty)
     }
 
     /// Returns a layer, shape `[H, W]`.

@@ -66,7 +66,7 @@ impl LearnedBelief for AutoencoderModel {
 
     fn check_world(&self, world: &WorldForm) -> Result<()> {
         let shape = self.autoencoder.shape();
-        world.check_observations(shape.n_observations, 1)?;
+        world.check_observations(shape.n_observations)?;
         ensure!(
             shape.grid == world.shape,
             "checkpoint: expected a network for the world's grid, {}, got one for {}",

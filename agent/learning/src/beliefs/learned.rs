@@ -121,8 +121,7 @@ impl LearnedBelief for LearnedModel {
     }
 
     fn check_world(&self, world: &WorldForm) -> Result<()> {
-        let dimensions = self.tables.dimensions;
-        world.check_observations(dimensions.n_observations, dimensions.n_matrices)
+        world.check_observations(self.tables.dimensions.n_observations)
     }
 }
 
@@ -180,8 +179,7 @@ pub fn sees_own_state(part: &Part<'_>) -> bool {
     shape.is_some_and(|shape| shape.len() == 5)
 }
 
-/// Completes the dimensions of a stored filter with the values that only its tensors reveal: the number of observation
-/// matrices, and whether there are own-state kernels.
+/// Completes the dimensions of a stored filter with whether there are own-state kernels, which only its tensors reveal.
 ///
 /// # Errors
 /// If a dimension is out of range, or the filter has kernels for zones.
@@ -194,10 +192,6 @@ pub fn dimensions_of(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensio
     )?;
     let dimensions = Dimensions {
         sees_own_state: sees_own_state(part),
-        n_matrices: match part.shape(Parameters::NAMES[1]) {
-            Some(&[_, n_matrices, _]) => n_matrices.max(1),
-            _ => 1,
-        },
         ..dimensions
     };
     let checked = dimensions.check();

@@ -110,7 +110,7 @@ impl LearnedBelief for NeuralModel {
     }
 
     fn check_world(&self, world: &WorldForm) -> Result<()> {
-        world.check_observations(self.network.n_observations(), 1)?;
+        world.check_observations(self.network.n_observations())?;
         let mut filters = self.filter.iter();
         filters.try_for_each(|filter| filter.check_world(world))
     }

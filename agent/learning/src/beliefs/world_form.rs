@@ -7,10 +7,8 @@ use emberwatch_model::{Model, Shape};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WorldForm {
     pub shape: Shape,
-    /// Number of values that can be observed in a cell, for all observation matrices together.
+    /// Number of values that can be observed in a cell.
     pub n_observations: usize,
-    /// Number of observation matrices of the sensor, at least 1.
-    pub n_matrices: usize,
 }
 
 impl WorldForm {
@@ -19,22 +17,15 @@ impl WorldForm {
         Self {
             shape,
             n_observations: model.n_observations(),
-            n_matrices: model.n_rings(),
         }
     }
 
-    /// Checks a belief's number of observations, and its number of observation matrices.
-    pub fn check_observations(&self, n_observations: usize, n_matrices: usize) -> Result<()> {
-        let (expected, got) = (self.n_observations, n_observations);
+    /// Checks a belief's number of observations.
+    pub fn check_observations(&self, got: usize) -> Result<()> {
+        let expected = self.n_observations;
         ensure!(
             got == expected,
             "checkpoint: expected the world's {expected} observations, got {got}"
-        );
-        let (expected, got) = (self.n_matrices, n_matrices);
-        ensure!(
-            got == expected,
-            "checkpoint: expected the {expected} observation matrices of the world's sensor, got {got}: the checkpoint \
-             belongs to worlds with another sensor"
         );
         Ok(())
     }

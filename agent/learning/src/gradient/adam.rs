@@ -63,7 +63,6 @@ mod tests {
             n_observations: 2,
             kernel: (1, 1),
             sees_own_state: false,
-            n_matrices: 1,
         };
         let mut parameters = Parameters::zeros(dimensions);
         let mut gradient = Parameters::zeros(dimensions);

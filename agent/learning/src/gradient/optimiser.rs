@@ -256,14 +256,13 @@ impl Optimiser {
     }
 
     /// Adds the gradient of the negative log-prior `-anchor * ln P(y | x)`, where y is the most likely observation of
-    /// state x in the sensor's first matrix, which applies to cells on the path. The paper assumes that "there is a
-    /// state which is observable with negligible uncertainties" (section III.E, remark).
+    /// state x. The paper assumes that "there is a state which is observable with negligible uncertainties" (section
+    /// III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
-        let dimensions = self.dimensions();
-        let (n_observations, n_of_matrix) = (dimensions.n_observations, dimensions.n_of_matrix());
+        let n_observations = self.dimensions().n_observations;
         let likelihood = self.parameters.likelihood();
-        let row = &likelihood[state * n_observations..][..n_of_matrix];
-        let shown = (0..n_of_matrix).max_by(|&a, &b| row[a].total_cmp(&row[b]));
+        let row = &likelihood[state * n_observations..][..n_observations];
+        let shown = (0..n_observations).max_by(|&a, &b| row[a].total_cmp(&row[b]));
         if let Some(shown) = shown {
             by_likelihood[state * n_observations + shown] -= self.config.anchor / row[shown];
         }

@@ -8,7 +8,7 @@ use crate::learned::Learned;
 use crate::policy::Policy;
 use crate::rollout::agent::{Agent, Chooser, Setup};
 use crate::rollout::{Actor, Rollout, Seen};
-use anyhow::{Result, ensure};
+use anyhow::Result;
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::observation::Observation;
@@ -90,22 +90,11 @@ impl Worlds {
         WorldForm {
             shape: self.shape(),
             n_observations: self.n_observations,
-            n_matrices: self.airspace.n_rings(),
         }
     }
 
     pub fn shape(&self) -> Shape {
         self.airspace.shape()
-    }
-
-    /// Checks that the sensor has a single observation matrix, which networks require.
-    pub(super) fn check_matrices(&self) -> Result<()> {
-        let n_rings = self.airspace.n_rings();
-        ensure!(
-            n_rings == 1,
-            "learner: expected a sensor with one observation matrix, which networks require, got {n_rings}"
-        );
-        Ok(())
     }
 
     /// Creates a rollout whose belief has not been corrected yet. `target` is the index of the state with the highest

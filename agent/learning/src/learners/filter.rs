@@ -77,16 +77,15 @@ fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
 }
 
 fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
-    let (learning, n_rings) = (config.learning, worlds.airspace.n_rings());
+    let learning = config.learning;
     let dimensions = Dimensions {
         n_states: match learning.states {
-            0 => worlds.n_observations / n_rings,
+            0 => worlds.n_observations,
             states => states,
         },
         n_observations: worlds.n_observations,
         kernel: (learning.kernel[0], learning.kernel[1]),
         sees_own_state: config.kernels == KernelKind::Own,
-        n_matrices: n_rings,
     };
     Ok(dimensions.check()?)
 }
@@ -209,10 +208,10 @@ impl Actor for FilterLearner {
         {
             let frame = &rollout.observation().frame;
             let start = record.before.robot.cell();
-            let paying = self.worlds.airspace.paying(start, &plan.moves);
+            let flight = self.worlds.airspace.fly(start, &plan.moves);
             self.fit.see(robot, frame, Some(predictor), &self.learned);
             let belief = rollout.agent.belief();
-            self.fit.earn(belief, &paying, record.reward);
+            self.fit.earn(belief, &flight.visited, record.reward);
         }
         Ok(records)
     }

@@ -43,7 +43,6 @@ pub const AUTOENCODER: LearnerKind = LearnerKind {
 };
 
 fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
-    on.worlds.check_matrices()?;
     let mut progress = Progress::first(&on.worlds, on.config, on.device)?;
     if let Some(contents) = on.contents {
         progress.load(contents)?;
@@ -234,8 +233,8 @@ impl Actor for NetworkLearner {
         let (record, rollout) = (&records[0], self.at_world());
         let path = self.decision.as_ref().map(|decision| &*decision.path);
         let start = record.before.robot.cell();
-        let paying = self.worlds.airspace.paying(start, path.unwrap_or_default());
-        let met = met(rollout.agent.belief(), paying.into_iter());
+        let flight = self.worlds.airspace.fly(start, path.unwrap_or_default());
+        let met = met(rollout.agent.belief(), &flight.visited);
         let frame = rollout.observation().frame.clone();
         let position = &mut self.progress.position;
         position.reward.add(&met, record.reward);

@@ -49,7 +49,6 @@ pub const NEURAL: LearnerKind = LearnerKind {
 };
 
 fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
-    on.worlds.check_matrices()?;
     let filter = on.learned.get::<LearnedModel>();
     let learner = NeuralLearner::new(on.contents, filter, on.worlds, on.config, on.device);
     Ok(Box::new(learner?))
@@ -228,9 +227,9 @@ impl Actor for NeuralLearner {
         for ((robot, run), record) in runs.zip(&records) {
             let (belief, observation) = (run.rollout.agent.belief(), run.rollout.observation());
             let start = record.before.robot.cell();
-            let paying = self.worlds.airspace.paying(start, &run.path);
+            let flight = self.worlds.airspace.fly(start, &run.path);
             self.reward
-                .add(&met(belief, paying.into_iter()), record.reward);
+                .add(&met(belief, &flight.visited), record.reward);
             let base = run.rollout.agent.estimator().base();
             self.replay.push(robot, &observation.frame, base);
         }

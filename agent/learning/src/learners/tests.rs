@@ -47,7 +47,6 @@ fn dimensions(sees_own_state: bool) -> Dimensions {
         n_observations: 3,
         kernel: (3, 3),
         sees_own_state,
-        n_matrices: 1,
     }
 }
 

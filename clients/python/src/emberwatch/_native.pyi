@@ -18,10 +18,6 @@ class _Airspace(Protocol):
     @property
     def radius(self) -> int: ...
     @property
-    def n_rings(self) -> int: ...
-    @property
-    def pays(self) -> str: ...
-    @property
     def no_fly(self) -> NDArray[np.bool_] | None: ...
 
 class _Text(Protocol):
@@ -254,8 +250,7 @@ class Flights:
     """The current path of each robot, up to its latest move; one row for each robot.
 
     `reward` is the reward of each state. If given, each cell pays the reward of its hidden state
-    when the path first visits it, or first sees it if the airspace pays for seen cells. A copied or
-    unpickled object has no moves.
+    when the path first visits it. A copied or unpickled object has no moves.
     """
 
     def __init__(

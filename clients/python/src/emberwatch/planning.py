@@ -36,8 +36,7 @@ def beam_search(
         width: Number of paths kept after each move, 1 to 65,536. The maximum is lower if that
             many would need more than 4 GiB; a larger width is refused. Among paths that visited
             the same cells and end in the same cell, only one is kept.
-        airspace: Where the robots may fly, such as `env.world_spec.airspace`. None: everywhere. If
-            its `pays` is `"seen"`, all cells within the sensor's view of the path count.
+        airspace: Where the robots may fly, such as `env.world_spec.airspace`. None: everywhere.
 
     Returns:
         The moves, shape (n, n_moves): 0 up, 1 down, 2 left, 3 right.

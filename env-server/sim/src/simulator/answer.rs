@@ -42,8 +42,7 @@ impl Part<'_> {
         self.frames.fill(UNOBSERVED);
         for robot in episode.robots() {
             let seen = robot.frame().as_bytes();
-            // Robots that see a cell in the same sensor ring have the same reading of it. If the rings differ, the
-            // minimum keeps the reading of the inner ring, which has the smaller value.
+            // All robots have the same reading of a cell, and unobserved cells have the largest value.
             (self.frames.iter_mut().zip(seen)).for_each(|(to, &value)| *to = value.min(*to));
         }
     }

@@ -298,13 +298,9 @@ impl Simulator {
 /// Describes no-fly cells and the sensor. Returns `None` if there are no no-fly cells and the sensor sees only the
 /// path.
 fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
-    let file = model.file();
-    let sensor = file.sensor.clone().unwrap_or_default();
     let info = AirspaceInfo {
-        radius: sensor.radius,
-        n_rings: model.n_rings(),
-        pays: sensor.pays,
-        no_fly: file.no_fly.as_ref().and_then(CellMap::rows),
+        radius: model.radius(),
+        no_fly: model.file().no_fly.as_ref().and_then(CellMap::rows),
     };
     (info.radius > 0 || info.no_fly.is_some()).then_some(info)
 }

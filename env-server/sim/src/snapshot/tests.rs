@@ -6,7 +6,7 @@ use crate::config::ServerConfig;
 use crate::world::{Episode, Flown, Rules, SavedWorld};
 use emberwatch_messages::control::CoverageRule;
 use emberwatch_model::task::Start;
-use emberwatch_model::{Airspace, Cell, Grid, Move, Pays};
+use emberwatch_model::{Airspace, Cell, Grid, Move};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -153,7 +153,7 @@ fn an_impossible_world_is_refused() {
     let bytes = bytes(&spec.settings, &episodes(&spec.rules));
     let closed = Grid::from_shape_fn((3, 5), |at| at == (CLOSED.row, CLOSED.col));
     let (shape, closed) = (spec.rules.shape, Some(Arc::new(closed)));
-    spec.rules.airspace = Airspace::new(shape, closed, 0, 1, Pays::Visited);
+    spec.rules.airspace = Airspace::new(shape, closed, 0);
     let mut wrong = Vec::new();
     for (change, words) in MISFITS {
         let mut snapshot = decode(&bytes).expect("a snapshot");

@@ -11,7 +11,7 @@ use super::reward::pay;
 use super::robot::{Robot, Scratch};
 use super::rules::Rules;
 use super::saved::{InvalidWorld, SavedRobot, SavedWorld};
-use super::sensor::{Sensor, path_cells};
+use super::sensor::Sensor;
 use emberwatch_model::path::path_from_bytes;
 use emberwatch_model::{Coverage, Frame, Grid};
 
@@ -198,7 +198,7 @@ impl Episode {
         } in &mut self.robots
         {
             if outcome.coverage == Coverage::Full {
-                sensor.observe(key, states, path_cells(0..rules.shape.n_cells()), frame);
+                sensor.observe(key, states, 0..rules.shape.n_cells(), frame);
             } else {
                 sensor.observe(key, states, seen.iter().copied(), frame);
             }
@@ -214,7 +214,6 @@ fn restored(rules: &Rules, saved: &SavedRobot) -> Result<Robot, InvalidWorld> {
         path: path_from_bytes(&saved.path).map_err(|error| InvalidWorld(error.to_string()))?,
         visited: Vec::new(),
         seen: Vec::new(),
-        paying: None,
     })
 }
 

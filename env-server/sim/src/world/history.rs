@@ -143,21 +143,18 @@ impl PastRobot {
             return;
         }
         let seen = robot.seen.iter();
-        self.cells.extend(seen.clone().map(|it| it.cell as u32));
-        self.values.extend(seen.map(|it| bytes[it.cell]));
+        self.cells.extend(seen.clone().map(|&cell| cell as u32));
+        self.values.extend(seen.map(|&cell| bytes[cell]));
     }
 
     /// Writes the observations into `frame`, one byte per cell. Cells that this robot did not observe keep their value.
-    /// If `frame` already contains an observation of a cell, the smaller value is kept, because it comes from the inner
-    /// sensor ring.
     pub fn write_over(&self, frame: &mut [u8]) {
         if self.cells.is_empty() && !self.values.is_empty() {
             frame.copy_from_slice(&self.values);
             return;
         }
         for (&cell, &value) in self.cells.iter().zip(&self.values) {
-            let frame = &mut frame[cell as usize];
-            *frame = value.min(*frame);
+            frame[cell as usize] = value;
         }
     }
 }

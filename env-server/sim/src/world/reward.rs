@@ -1,10 +1,8 @@
-//! The rewards of a step. Visited cells yield rewards, and a cell that several robots visit counts once. With
-//! `Pays::Seen`, the cells that robots see yield rewards instead.
+//! The rewards of a step. Visited cells yield rewards, and a cell that several robots visit counts once.
 
 use super::outcome::WorldOutcome;
 use super::robot::Robot;
 use super::rules::Rules;
-use emberwatch_model::Pays;
 
 /// Flag in a cell's count. It is set when the cell's reward has been added to the team's total.
 const PAID: u8 = 0x80;
@@ -20,16 +18,13 @@ pub(super) fn pay(
 ) {
     (team.reward, team.n_visited, team.n_hits) = (0.0, 0, 0);
     for robot in &*robots {
-        robot.paying().iter().for_each(|&cell| counts[cell] += 1);
+        robot.visited.iter().for_each(|&cell| counts[cell] += 1);
     }
     for Robot {
-        visited,
-        paying,
-        outcome,
-        ..
+        visited, outcome, ..
     } in &mut *robots
     {
-        for &cell in paying.as_ref().unwrap_or(visited) {
+        for &cell in &*visited {
             let reward = rules.reward[usize::from(states[cell])];
             let is_hit = u32::from(states[cell] == rules.target_state);
             let n_visitors = counts[cell] & !PAID;
@@ -47,23 +42,8 @@ pub(super) fn pay(
         }
     }
     for robot in &*robots {
-        robot.paying().iter().for_each(|&cell| counts[cell] = 0);
+        robot.visited.iter().for_each(|&cell| counts[cell] = 0);
     }
-    if rules.airspace.pays() == Pays::Seen {
-        team.n_visited = n_distinct(robots, counts);
-    }
-}
-
-/// Counts the distinct cells that the robots visited.
-fn n_distinct(robots: &[Robot], counts: &mut [u8]) -> u32 {
-    let mut n_visited = 0;
-    for &cell in robots.iter().flat_map(|robot| &robot.visited) {
-        n_visited += u32::from(counts[cell] == 0);
-        counts[cell] = 1;
-    }
-    let visited = robots.iter().flat_map(|robot| &robot.visited);
-    visited.for_each(|&cell| counts[cell] = 0);
-    n_visited
 }
 
 #[cfg(test)]

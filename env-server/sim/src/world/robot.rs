@@ -2,7 +2,6 @@
 
 use super::outcome::RobotOutcome;
 use emberwatch_model::{Airspace, Cell, Coverage, Frame, Move};
-use emberwatch_model::{Pays, SeenCell};
 
 /// The state of a robot after a step or a reset.
 #[derive(Debug, Clone)]
@@ -12,23 +11,21 @@ pub struct Robot {
     pub(super) path: Vec<Move>,
     /// Row-major indices of the distinct cells of the path, in the order of the first visit.
     pub(super) visited: Vec<usize>,
-    /// The cells that the sensor sees from the visited cells.
-    pub(super) seen: Vec<SeenCell>,
-    /// Row-major indices of the distinct rewarded cells. `None` if these are the visited cells.
-    pub(super) paying: Option<Vec<usize>>,
+    /// Row-major indices of the cells that the sensor sees from the visited cells.
+    pub(super) seen: Vec<usize>,
 }
 
 /// Reusable buffers for flights, with arbitrary content between calls.
 #[derive(Debug, Clone, Default)]
 pub struct Scratch {
     visited: Vec<u64>,
-    rings: Vec<u8>,
+    is_seen: Vec<bool>,
 }
 
 /// Returns the memory in bytes of a robot with its next path, if the robot sees up to `most_seen` of `n_cells` cells.
 pub fn bytes_of_robot(n_moves: usize, most_seen: usize, n_cells: usize) -> usize {
     let of_path = n_moves * (2 * size_of::<Move>() + size_of::<usize>());
-    let of_sight = most_seen * (size_of::<SeenCell>() + size_of::<usize>());
+    let of_sight = most_seen * size_of::<usize>();
     size_of::<Robot>() + n_cells + of_path + of_sight
 }
 
@@ -41,7 +38,6 @@ impl Robot {
             path: Vec::new(),
             visited: Vec::new(),
             seen: Vec::new(),
-            paying: None,
         };
         robot.fly(airspace, &[], Coverage::Empty, &mut Scratch::default());
         robot
@@ -57,9 +53,7 @@ impl Robot {
     ) {
         let start = self.cell();
         let end = airspace.fly_into(start, path, &mut self.visited, &mut scratch.visited);
-        airspace.see_into(&self.visited, &mut self.seen, &mut scratch.rings);
-        self.paying = (airspace.pays() == Pays::Seen)
-            .then(|| self.seen.iter().map(|seen| seen.cell).collect());
+        airspace.see_into(&self.visited, &mut self.seen, &mut scratch.is_seen);
         self.path.clear();
         self.path.extend_from_slice(path);
         self.frame.clear();
@@ -75,11 +69,6 @@ impl Robot {
     /// Returns the robot's outcome of the last step or reset.
     pub fn outcome(&self) -> &RobotOutcome {
         &self.outcome
-    }
-
-    /// Returns the row-major indices of the distinct rewarded cells.
-    pub(super) fn paying(&self) -> &[usize] {
-        self.paying.as_ref().unwrap_or(&self.visited)
     }
 
     /// Returns the frame of the last step.

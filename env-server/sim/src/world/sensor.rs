@@ -1,10 +1,9 @@
 //! Observation noise: draws a sensor's reading of each observed cell (paper eq. 1).
 //!
-//! A reading is a pure function of (seed, step, cell, ring), so two agents that observe the same cell in the same step
-//! and ring get the same reading. One ChaCha8 draw gives a key for the step, and SplitMix64 with this key generates
+//! A reading is a pure function of (seed, step, cell), so two agents that observe the same cell in the same step get
+//! the same reading. One ChaCha8 draw gives a key for the step, and SplitMix64 with this key generates
 //! each cell's random number. So the cost is constant per observed cell, and other cells cost nothing.
 
-use emberwatch_model::SeenCell;
 use emberwatch_model::randomness::{Purpose, split_mix, stream};
 use emberwatch_model::{Frame, Grid, Model};
 use rand_chacha::rand_core::Rng;
@@ -12,18 +11,16 @@ use rand_chacha::rand_core::Rng;
 /// The observation probabilities `P(y | x)` as thresholds on a 32-bit random number.
 #[derive(Debug, Clone)]
 pub struct Sensor {
-    /// `thresholds[(x * n_rings + ring) * n_named + y]` is the upper end of the interval of 32-bit numbers that give
-    /// observation `y` in state `x`.
+    /// `thresholds[x * n_observations + y]` is the upper end of the interval of 32-bit numbers that give observation `y`
+    /// in state `x`.
     thresholds: Vec<u64>,
-    n_rings: usize,
-    /// Number of observations per ring.
-    n_named: usize,
+    n_observations: usize,
 }
 
 impl Sensor {
     /// Creates the sensor of a model.
     pub fn new(model: &Model) -> Self {
-        let (n_rings, n_named) = (model.n_rings(), model.n_observations() / model.n_rings());
+        let n_observations = model.n_observations();
         let cumulative = |row: &[f64]| {
             let mut sum = 0.0;
             let mut thresholds: Vec<u64> = row
@@ -39,12 +36,11 @@ impl Sensor {
             thresholds
         };
         let likelihood = model.likelihood().as_standard_layout();
-        let of_rings = likelihood.as_slice().expect("invariant: row-major");
-        let of_rings = of_rings.chunks_exact(n_named);
+        let rows = likelihood.as_slice().expect("invariant: row-major");
+        let rows = rows.chunks_exact(n_observations);
         Self {
-            thresholds: of_rings.flat_map(cumulative).collect(),
-            n_rings,
-            n_named,
+            thresholds: rows.flat_map(cumulative).collect(),
+            n_observations,
         }
     }
 
@@ -58,26 +54,20 @@ impl Sensor {
         &self,
         key: u64,
         states: &Grid<u8>,
-        cells: impl IntoIterator<Item = SeenCell>,
+        cells: impl IntoIterator<Item = usize>,
         frame: &mut Frame,
     ) {
         let states = states.as_slice().expect("invariant: states are row-major");
-        for SeenCell { cell, ring } in cells {
+        for cell in cells {
             let number = split_mix(key, cell as u64) >> 32;
-            let row = usize::from(states[cell]) * self.n_rings + usize::from(ring);
-            let of_state = &self.thresholds[row * self.n_named..][..self.n_named];
+            let first = usize::from(states[cell]) * self.n_observations;
+            let of_state = &self.thresholds[first..][..self.n_observations];
             // Compares with all thresholds, because a loop that stops early would cause a branch misprediction at every
             // latent cell.
             let passed = of_state.iter().filter(|threshold| number >= **threshold);
-            let reading = passed.count() + usize::from(ring) * self.n_named;
-            frame.observe(cell, reading as u8);
+            frame.observe(cell, passed.count() as u8);
         }
     }
-}
-
-/// Converts cells on the path to seen cells, which lie in ring 0.
-pub(super) fn path_cells(cells: impl Iterator<Item = usize>) -> impl Iterator<Item = SeenCell> {
-    cells.map(|cell| SeenCell { cell, ring: 0 })
 }
 
 #[cfg(test)]
@@ -98,7 +88,7 @@ mod tests {
             let states = Grid::from_elem(shape.dim(), state as u8);
             let look = |step: u64, cells: &[usize]| {
                 let mut frame = Frame::empty(shape);
-                let cells = path_cells(cells.iter().copied());
+                let cells = cells.iter().copied();
                 sensor.observe(Sensor::key(7, step), &states, cells, &mut frame);
                 frame
             };

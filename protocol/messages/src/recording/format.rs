@@ -2,19 +2,21 @@
 
 use crate::capacity::{MAX_ROBOTS, MAX_TEAM_CELLS};
 use crate::control::{MAX_CONTROL_BYTES, ServerInfo};
-use crate::message::{FrameHeader, TruthHeader};
+use crate::message::{FrameHeader, TruthHeader, VERSION};
 use crate::payload::ROBOT_BYTES;
 use crate::sample::Sample;
 use bytemuck::{Pod, Zeroable};
 use emberwatch_model::path::MAX_MOVES;
 use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
 use thiserror::Error;
 
 /// The first bytes of every recording.
 pub const MAGIC: [u8; 8] = *b"EMBERREC";
 
-/// Version of the format. A file in the other byte order has a different value here, and is rejected.
-pub const VERSION: u32 = 2;
+/// Versions of the format that can be read, each the protocol version of the samples. The last one is written. A file
+/// in the other byte order has a different value here, and is rejected.
+pub const VERSIONS: RangeInclusive<u32> = 2..=VERSION;
 
 /// Maximum size of a body before compression in bytes, enough for the largest team with the largest frames and the
 /// longest paths.
@@ -31,7 +33,7 @@ pub const MAX_STORED_BYTES: usize = MAX_BODY_BYTES + MAX_BODY_BYTES / 1024 + 64;
 pub struct FileHeader {
     /// [`MAGIC`].
     pub magic: [u8; 8],
-    /// [`VERSION`].
+    /// One of [`VERSIONS`].
     pub version: u32,
     /// Reserved; always 0.
     pub reserved: u32,

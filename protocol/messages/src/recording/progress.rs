@@ -3,7 +3,6 @@
 use super::format::{Event, Record, Totals};
 use crate::capacity::{MAX_ROBOTS, MAX_TEAM_CELLS};
 use crate::control::ServerInfo;
-use crate::message::VERSION;
 use crate::payload::{RobotSample, split_frame_payload};
 use crate::sample::Sample;
 use emberwatch_model::path::MAX_MOVES;
@@ -14,6 +13,8 @@ use std::fmt::Display;
 /// the other would reject.
 #[derive(Debug, Default)]
 pub(super) struct Progress {
+    /// Protocol version of the samples.
+    version: u32,
     pub(super) nanos: u64,
     server: Option<Limits>,
     pub(super) totals: Totals,
@@ -34,6 +35,14 @@ struct Limits {
 }
 
 impl Progress {
+    /// Creates the state of a recording without records.
+    pub(super) fn new(version: u32) -> Self {
+        Self {
+            version,
+            ..Self::default()
+        }
+    }
+
     /// Checks and counts a record.
     ///
     /// # Errors
@@ -52,7 +61,8 @@ impl Progress {
             }
             Event::Frame(Sample { header, payload }) => {
                 let limits = limits(self.server.as_ref())?;
-                limits.check(header.version, header.world, (header.height, header.width))?;
+                expect("sample version", &self.version, &header.version)?;
+                limits.check(header.world, (header.height, header.width))?;
                 let robots = split_frame_payload(header, payload)?;
                 limits.check_robots(header.world, header.first_robot, &robots)?;
                 totals.n_frames += 1;
@@ -64,7 +74,8 @@ impl Progress {
             Event::Truth(Sample { header, payload }) => {
                 let grid = (header.height, header.width);
                 let limits = limits(self.server.as_ref())?;
-                limits.check(header.version, header.world, grid)?;
+                expect("sample version", &self.version, &header.version)?;
+                limits.check(header.world, grid)?;
                 let n_cells = limits.height * limits.width;
                 expect("payload bytes", &n_cells, &payload.len())?;
                 totals.n_truths += 1;
@@ -105,8 +116,7 @@ impl Limits {
         })
     }
 
-    fn check(&self, version: u32, world: u32, (height, width): (u32, u32)) -> Result<(), String> {
-        expect("sample version", &VERSION, &version)?;
+    fn check(&self, world: u32, (height, width): (u32, u32)) -> Result<(), String> {
         expect(
             "grid",
             &format!("{} x {}", self.height, self.width),

@@ -2,13 +2,15 @@
 
 use super::format::{
     Event, FileHeader, Kind, MAGIC, MAX_BODY_BYTES, MAX_STORED_BYTES, Record, RecordHeader,
-    RecordingError, Totals, VERSION, checksum,
+    RecordingError, Totals, VERSIONS, checksum,
 };
 use super::progress::Progress;
+use crate::control::ServerInfo;
 use crate::sample::Sample;
 use bytemuck::{Pod, Zeroable};
 use flate2::bufread::DeflateDecoder;
 use serde::de::DeserializeOwned;
+use serde_json::Value;
 use std::io::Read;
 
 /// A reader of a recording: an iterator of records that ends after the first error.
@@ -47,9 +49,9 @@ impl<R: Read> Reader<R> {
                 n_steps: 0,
             });
         }
-        if header.version != VERSION {
-            let got = header.version;
-            let problem = format!("recording version: expected {VERSION}, got {got}");
+        if !VERSIONS.contains(&header.version) {
+            let (first, last, got) = (VERSIONS.start(), VERSIONS.end(), header.version);
+            let problem = format!("recording version: expected {first} to {last}, got {got}");
             return Err(RecordingError::Foreign(problem));
         }
         if header.reserved != 0 {
@@ -60,7 +62,7 @@ impl<R: Read> Reader<R> {
         Ok(Self {
             input,
             offset: n_read as u64,
-            progress: Progress::default(),
+            progress: Progress::new(header.version),
             stored: Vec::new(),
             is_over: false,
         })
@@ -112,6 +114,9 @@ impl<R: Read> Reader<R> {
         self.offset += (n_read + length) as u64;
         if header.kind == Kind::End as u32 {
             return self.check_end(&body).map_err(damaged).map(|()| None);
+        }
+        if header.kind == Kind::Server as u32 {
+            check_sensor(&body)?;
         }
         let record = Record {
             nanos: header.nanos,
@@ -185,11 +190,35 @@ fn inflated(stored: &[u8]) -> Result<Vec<u8>, String> {
 
 fn event(kind: u32, body: &[u8]) -> Result<Event, String> {
     match kind {
-        kind if kind == Kind::Server as u32 => Ok(Event::Server(Box::new(json(body)?))),
+        kind if kind == Kind::Server as u32 => Ok(Event::Server(Box::new(server(body)?))),
         kind if kind == Kind::Frame as u32 => Ok(Event::Frame(sample(body)?)),
         kind if kind == Kind::Truth as u32 => Ok(Event::Truth(sample(body)?)),
         got => Err(format!("kind: expected 1 to 4, got {got}")),
     }
+}
+
+/// Checks that a server of version 2 had the sensor and the rewards of this version.
+fn check_sensor(body: &[u8]) -> Result<(), RecordingError> {
+    let server: Value = serde_json::from_slice(body).unwrap_or_default();
+    let airspace = &server["airspace"];
+    if airspace["n_rings"].as_u64().unwrap_or(1) == 1 && airspace["pays"] != "seen" {
+        return Ok(());
+    }
+    let expected = "a sensor with one observation matrix, and rewards for visited cells";
+    Err(RecordingError::Foreign(format!(
+        "recording: expected {expected}, got {airspace}: use the release that recorded it"
+    )))
+}
+
+/// Parses a server's description. Models of version 2 state that visited cells pay, which is now the only rule.
+fn server(body: &[u8]) -> Result<ServerInfo, String> {
+    let mut info: ServerInfo = json(body)?;
+    let recorded = info.recorded_world.as_mut();
+    let description = recorded.and_then(|recorded| recorded.description.as_mut());
+    for text in info.model.iter_mut().chain(description) {
+        *text = text.replace("pays = \"visited\"\n", "");
+    }
+    Ok(info)
 }
 
 fn sample<H: Pod>(body: &[u8]) -> Result<Sample<H>, String> {

@@ -2,9 +2,10 @@
 
 use super::format::{
     Event, FileHeader, Kind, MAGIC, MAX_BODY_BYTES, Record, RecordHeader, RecordingError, Totals,
-    VERSION, checksum,
+    checksum,
 };
 use super::progress::Progress;
+use crate::message::VERSION;
 use flate2::{Compress, Compression, FlushCompress, Status};
 use std::io::Write;
 
@@ -39,7 +40,7 @@ impl<W: Write> Writer<W> {
         output.write_all(bytemuck::bytes_of(&header))?;
         Ok(Self {
             output,
-            progress: Progress::default(),
+            progress: Progress::new(VERSION),
             compressor: Compress::new(Compression::new(LEVEL), false),
             body: Vec::new(),
             stored: Vec::new(),

@@ -1,10 +1,9 @@
 //! Compares the cells where robots may fly, and the cells that they see, with the results of plain loops over the grid.
 
 use super::models::{shape, unit};
-use super::refusals::LAND;
-use emberwatch_model::{Airspace, Cell, CellMap, Grid, Model, Move, Parts, Pays};
+use emberwatch_model::{Airspace, Cell, CellMap, Grid, Model, Move, Parts};
 use proptest::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 fn random_map(key: u64, (height, width): (usize, usize)) -> Grid<bool> {
@@ -27,7 +26,6 @@ proptest! {
         let mut map = random_map(key, side);
         let start = [(unit(key, 900) * height as f64) as usize, (unit(key, 901) * width as f64) as usize];
         map[start] = false;
-        let n_rings = 1 + (unit(key, 902) * (radius + 1) as f64) as usize;
         let moves: Vec<usize> = (0..n_moves).map(|t| (unit(key + 1, t) * 4.0) as usize).collect();
 
         let mut at = start.map(|at| at as isize);
@@ -44,24 +42,22 @@ proptest! {
                 visited.push(cell);
             }
         }
-        let mut expected = BTreeMap::new();
+        let mut expected = BTreeSet::new();
         for (row, col) in ndarray::indices(side) {
             let distance = |&from: &usize| (from / width).abs_diff(row).max((from % width).abs_diff(col));
-            if let Some(nearest) = visited.iter().map(distance).min().filter(|&it| it <= radius) {
-                expected.insert(row * width + col, nearest.min(n_rings - 1) as u8);
+            if visited.iter().map(distance).min().is_some_and(|nearest| nearest <= radius) {
+                expected.insert(row * width + col);
             }
         }
 
-        let air = Airspace::new(shape(height, width), Some(Arc::new(map)), radius, n_rings, Pays::Seen);
+        let air = Airspace::new(shape(height, width), Some(Arc::new(map)), radius);
         let path: Vec<Move> = moves.iter().map(|&step| Move::from_low_bits(step as u64)).collect();
         let flight = air.fly(Cell { row: start[0], col: start[1] }, &path);
         prop_assert_eq!(&flight.visited, &visited);
         prop_assert_eq!([flight.end.row as isize, flight.end.col as isize], at);
         let seen = air.see(&flight.visited);
         prop_assert_eq!(seen.len(), expected.len());
-        for it in seen {
-            prop_assert_eq!(expected.get(&it.cell), Some(&it.ring));
-        }
+        prop_assert_eq!(BTreeSet::from_iter(seen), expected);
     }
 }
 
@@ -78,13 +74,7 @@ fn random_starts_are_the_largest_connected_part() {
         let (cells, grid) = (rows.concat(), shape(rows.len(), rows[0].len()));
         let map = cells.bytes().map(|it| it == b'#').collect();
         let map = Grid::from_shape_vec(grid.dim(), map).expect("rows of one length");
-        let found = Parts::of(&Airspace::new(
-            grid,
-            Some(Arc::new(map)),
-            0,
-            1,
-            Pays::Visited,
-        ));
+        let found = Parts::of(&Airspace::new(grid, Some(Arc::new(map)), 0));
         let starts: Vec<usize> = cells.match_indices('*').map(|(at, _)| at).collect();
         assert_eq!(found.n_free(), cells.replace('#', "").len(), "{picture}");
         assert_eq!(found.n_largest(), starts.len().max(1), "{picture}");
@@ -101,25 +91,10 @@ fn random_starts_are_the_largest_connected_part() {
 }
 
 #[test]
-fn each_ring_has_its_own_observations() {
-    let model = Model::from_toml(LAND).expect("a model");
-    assert_eq!((model.n_rings(), model.n_observations()), (3, 6));
-    let row: Vec<f64> = model.likelihood().row(1).to_vec();
-    assert_eq!(row, [0.0, 1.0, 0.25, 0.75, 0.5, 0.5]);
-    let names = model.observation_names();
-    assert_eq!(
-        names,
-        ["x", "y", "x ring 1", "y ring 1", "x ring 2", "y ring 2"]
-    );
-    for (radius, n_rings) in [(0, 1), (1, 2), (8, 3)] {
-        let model = model.clone().with_radius(radius).expect("a model");
-        let air = model.airspace(shape(1, 3)).expect("the grid");
-        assert_eq!((air.radius(), air.n_rings()), (radius, n_rings));
-    }
+fn an_airspace_without_effect_is_open() {
     assert_eq!(Model::wildfire().with_radius(0), Ok(Model::wildfire()));
-    // An airspace is open if its map and sensor have no effect.
     let nowhere = Some(Arc::new(Grid::from_elem((2, 3), false)));
-    let air = Airspace::new(shape(2, 3), nowhere, 0, 1, Pays::Seen);
+    let air = Airspace::new(shape(2, 3), nowhere, 0);
     assert_eq!(air, Airspace::open(shape(2, 3)));
 }
 

@@ -4,7 +4,7 @@ use super::models::{checked, shape};
 use emberwatch_model::{KernelEntry, Model, ModelError, StateEntry, ZoneEntry};
 
 /// A model with every key: two zones and an edge, a sensor, no-fly cells, and own-state kernels.
-pub const LAND: &str = r##"
+const LAND: &str = r##"
 name = "land"
 kernel_size = [1, 1]
 edge = "a"
@@ -13,8 +13,6 @@ no_fly = [[0, 0, 1]]
 zones = [{ name = "z0", color = "#000000" }, { name = "z1", color = "#808080" }]
 observations = [{ name = "x", color = "#000000" }, { name = "y", color = "#ffffff" }]
 sensor.radius = 3
-sensor.pays = "visited"
-sensor.rings = [{ observed_as = [[0.8, 0.2], [0.25, 0.75]] }, { observed_as = [[0.7, 0.3], [0.5, 0.5]] }]
 states = [
     { name = "a", color = "#000000", initial = 0.75, bias = 0.0, observed_as = [1.0, 0.0] },
     { name = "b", color = "#ff0000", initial = 0.25, reward = 1.0, observed_as = [0.0, 1.0] },
@@ -84,11 +82,8 @@ zone_map = [[0, 1, 1]] =>  => zone_map: expected the zone of each cell, got none
 [[0, 0, 1]] => [[0, 0, 2]] => no_fly: expected 0 or 1 for each cell, got 2
 [[0, 0, 1]] => [[1, 1, 1]] => no_fly: expected a cell where robots may be, got none
 radius = 3 => radius = 9 => sensor: radius: expected 0 to 8 cells, got 9
-radius = 3 => radius = 1 => sensor: rings: expected at most 1 rings, the sensor's radius, got 2
-[[0.7, 0.3], [0.5, 0.5]] => [[0.7, 0.3]] => sensor: ring 2: observed_as: expected 2 rows, one per state, got 1
-[0.5, 0.5] => [1.0] => sensor: ring 2: observed_as of state "b": expected 2 probabilities
-[0.5, 0.5] => [0.0, 0.0] => sensor: ring 2: observed_as of state "b": expected a sum of 1, got 0
-"visited" => "bought" => expected `visited` or `seen`
+radius = 3 => rings = [] => remove `rings`: a sensor has one observation matrix
+radius = 3 => pays = "visited" => remove `pays`: a sensor has one observation matrix
 "##;
 
 #[test]

@@ -73,10 +73,10 @@ impl FilterFit {
         self.neighbours.see(robot, frame, predictor, tables, target);
     }
 
-    /// Records the reward of a path. `posterior` is the belief after the path's frame, and `paying` contains the cells
-    /// that the reward is summed over.
-    pub fn earn(&mut self, posterior: &Belief, paying: &[usize], reward: f64) {
-        let met = met(posterior, paying.iter().copied());
+    /// Records the reward of a path. `posterior` is the belief after the path's frame, and `visited` contains the
+    /// distinct cells of the path.
+    pub fn earn(&mut self, posterior: &Belief, visited: &[usize], reward: f64) {
+        let met = met(posterior, visited);
         self.reward.add(&met, reward);
         self.world_steps += 1;
         self.earned += self.optimiser.config().updates_per_step;
@@ -177,8 +177,6 @@ impl FilterFit {
         let of_file = dimensions_of(dimensions, &contents.part(""))?;
         let [expected, got] = [dimensions, of_file].map(|it| KernelKind::of(it.sees_own_state));
         check(got == expected, "kernels", expected, got)?;
-        let (expected, got) = (dimensions.n_matrices, of_file.n_matrices);
-        check(got == expected, "observation matrices", expected, got)?;
         saved.load(contents, dimensions)?;
         let mut fit = Self::new(dimensions, shape, config);
         if saved.optimiser.cut() == fit.optimiser.cut() {
@@ -216,7 +214,6 @@ mod tests {
         n_observations: 2,
         kernel: (1, 3),
         sees_own_state: false,
-        n_matrices: 1,
     };
 
     fn shape() -> Shape {
@@ -285,23 +282,6 @@ mod tests {
         let other = resume(&stored, DIMENSIONS, &config).expect("whole");
         assert!(!other.has_track(4), "an empty replay");
         assert_eq!(contents(&other).tensors, stored.tensors);
-    }
-
-    #[test]
-    fn checkpoints_keep_observation_matrices() {
-        let dimensions = Dimensions {
-            n_matrices: 2,
-            ..DIMENSIONS
-        };
-        let mut fit = FilterFit::new(dimensions, shape(), &config());
-        fit.begin(4);
-        see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
-        assert!(fit.n_updates() > 0);
-        let stored = contents(&fit);
-        let same = resume(&stored, dimensions, &config()).expect("whole");
-        assert!(contents(&same) == stored);
-        let error = resume(&stored, DIMENSIONS, &config()).expect_err("another sensor");
-        assert_eq!(error, "observation matrices: expected 1, got 2");
     }
 
     #[test]

@@ -211,10 +211,9 @@ def _land(given: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Airspac
     airspace, zones = given.get("airspace"), given.get("zones")
     try:
         if airspace is not None:
-            kept = {name: airspace[name] for name in ("radius", "n_rings", "pays")}
             rows = airspace.get("no_fly")
             no_fly = None if rows is None else _cells("no_fly", rows, shape, 2) != 0
-            land["airspace"] = Airspace(**kept, no_fly=no_fly)
+            land["airspace"] = Airspace(radius=airspace["radius"], no_fly=no_fly)
         if zones is not None:
             names, colors = (tuple(map(str, zones[name])) for name in ("names", "colors"))
             if len(names) != len(tuple(map(color_from_hex, colors))):

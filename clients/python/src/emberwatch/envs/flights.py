@@ -9,7 +9,7 @@ def flights_of(spec: WorldSpec, n_rows: int, *, pays: bool) -> Flights:
     """Makes the state of the current paths of `n_rows` robots.
 
     With `pays`, moves are rewarded: each cell pays the reward of its hidden state when the path
-    first visits it, or first sees it if the airspace pays for seen cells.
+    first visits it.
     """
     if pays and spec.described is None:
         raise InvalidArgumentError("reward='move': expected a server that reveals its model")

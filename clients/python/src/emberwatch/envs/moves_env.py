@@ -56,15 +56,15 @@ class WildfireMovesEnv(WorldEnv):
 
     1. The probability of the state that pays most.
     2. The entropy of the belief divided by log S. Channels 1 and 2 are 0 in the cells that this
-       path has visited, or has seen if the model pays for seen cells.
+       path has visited.
     3. 1 in the cells that this path has visited.
     4. 1 off the grid and in no-fly cells.
     5. The share of the path's moves that remain, the same in all cells.
 
     `recent` needs no model. It has one channel for each of the O observed values. The channel of a
     cell's last observed value is 255 if the last frame observed it, and halves every 16 steps; the
-    cell's other channels are 0. In cells that this path has visited (or seen, as in `local`), all O
-    channels are 0. The last three channels are channels 3 to 5 of `local`.
+    cell's other channels are 0. In cells that this path has visited, all O channels are 0. The last
+    three channels are channels 3 to 5 of `local`.
 
     ## Rewards
 
@@ -74,9 +74,8 @@ class WildfireMovesEnv(WorldEnv):
     several robots, as in `WildfireEnv`.
 
     With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
-    the world moves. (If the model pays for seen cells, a cell pays when it is first seen.) The last
-    move's reward also includes a correction, so that the rewards of a path sum to the robot's share
-    of the path's true reward, as with `"share"`. The correction is small for a lone robot, as one
+    the world moves. The last move's reward also includes a correction, so that the rewards of a
+    path sum to the robot's share of the path's true reward, as with `"share"`. The correction is small for a lone robot, as one
     step changes few cells. But `"move"` reveals more about the hidden state than `"share"` does,
     and earlier, so results with the two rewards are not comparable. `"move"` needs the hidden
     states: with `instance`, the server must publish them.

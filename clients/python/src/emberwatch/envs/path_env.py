@@ -66,9 +66,8 @@ class WildfireEnv(WorldEnv):
     ## Rewards
 
     In the wildfire model, the number of distinct visited cells that burn after the world has moved.
-    In general, the sum of the model's rewards over the distinct visited cells, or over the distinct
-    seen cells if the model pays for those. The start cell counts only if the path returns to it. In
-    a world of several robots, `reward` chooses between `"share"` (the default: a cell that v robots
+    In general, the sum of the model's rewards over the distinct visited cells. The start cell
+    counts only if the path returns to it. In a world of several robots, `reward` chooses between `"share"` (the default: a cell that v robots
     visited pays each of them 1 / v), `"team"` (the reward of all robots together), and `"marginal"`
     (how much lower the team's reward would be without this robot).
 

@@ -27,9 +27,8 @@ class View:
                 "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr(render_mode)
             )
         self.mode: Final = render_mode
-        source, n_rings = spec.described or spec.n_observations, spec.airspace.n_rings
         self._scenery: Final = Scenery.of(spec.airspace, spec.zones)
-        self._palette: Final = Palette.of(source, n_rings=n_rings)
+        self._palette: Final = Palette.of(spec.described or spec.n_observations)
         self._screen: Screen | None = None
 
     def draw(

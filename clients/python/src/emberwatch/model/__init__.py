@@ -26,9 +26,8 @@ Color = tuple[int, int, int]
 class Description:
     """The states and observations of a model, or of recorded worlds, which have no model.
 
-    S is the number of states. O is the number of observed values: the number of observations in the
-    file times the number of observation matrices of the sensor. Two descriptions are equal if all
-    their fields except `toml` are equal.
+    S is the number of states, and O the number of observed values. Two descriptions are equal if
+    all their fields except `toml` are equal.
     """
 
     name: str
@@ -38,16 +37,14 @@ class Description:
     state_colors: tuple[Color, ...]
     """One colour for each state."""
     observation_names: tuple[str, ...]
-    """One name for each observed value. Names of values that are observed in a ring around the path
-    end with the ring, as in `fire ring 1`."""
+    """One name for each observed value."""
     observation_colors: tuple[Color, ...]
     """One colour for each observed value."""
     observation_matrix: NDArray[np.float64]
-    """``O[state, observed value]``, shape (S, O). The columns are `n_rings` matrices side by side;
-    each row of each matrix is a distribution."""
+    """``O[state, observed value]``, shape (S, O). Each row is a distribution."""
     reward: NDArray[np.float64]
     """Reward of a cell in each state, shape (S,). A step pays this reward once for each distinct
-    cell that the robot visited or saw, as `pays` specifies."""
+    cell that the robot visited."""
     airspace: Airspace
     """Where robots may fly and what they see."""
     toml: str
@@ -76,16 +73,6 @@ class Description:
     def sensor_radius(self) -> int:
         """Number of rows and columns that robots see beyond each cell of their path."""
         return self.airspace.radius
-
-    @property
-    def n_rings(self) -> int:
-        """Number of observation matrices: one for the path, then one for each ring around it."""
-        return self.airspace.n_rings
-
-    @property
-    def pays(self) -> str:
-        """Which distinct cells pay a reward: the `"visited"` or the `"seen"` ones."""
-        return self.airspace.pays
 
     @property
     def no_fly(self) -> NDArray[np.bool_] | None:

@@ -13,27 +13,18 @@ from emberwatch.errors import invalid
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Airspace:
-    """Where robots may fly, what their sensor sees, and which cells pay.
+    """Where robots may fly, and what their sensor sees.
 
     By default robots may fly everywhere, and they see the cells of their path.
     """
 
     radius: int = 0
     """Number of rows and columns that robots see beyond each cell of their path."""
-    n_rings: int = 1
-    """Number of observation matrices: one for the path, then one for each ring around it. The last
-    one also applies to all rings further out. Matrix m adds ``m * O / n_rings`` to the value that
-    the same observation has on the path."""
-    pays: str = "visited"
-    """Which distinct cells pay a reward: the `"visited"` or the `"seen"` ones."""
     no_fly: NDArray[np.bool_] | None = None
     """True in the no-fly cells, shape (H, W). A robot that moves into one stays where it is."""
 
     def __post_init__(self) -> None:
         as_count(self.radius, "radius", 0, MAX_RADIUS)
-        as_count(self.n_rings, "n_rings", 1, self.radius + 1)
-        if self.pays not in ("visited", "seen"):
-            raise invalid("pays", "'visited' or 'seen'", repr_of(self.pays))
         given: Any = self.no_fly
         if given is not None:
             if getattr(given, "dtype", None) != np.bool_ or given.ndim != 2:
@@ -43,11 +34,11 @@ class Airspace:
         return isinstance(other, Airspace) and self._values() == other._values()
 
     def __hash__(self) -> int:
-        return hash((self.radius, self.n_rings, self.pays))
+        return hash(self.radius)
 
     def _values(self) -> tuple[object, ...]:
         no_fly = None if self.no_fly is None else self.no_fly.tolist()
-        return self.radius, self.n_rings, self.pays, no_fly
+        return self.radius, no_fly
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -48,21 +48,18 @@ class Palette:
     """Colour of a path over observed cells: dark or light, whichever has more contrast to them."""
 
     @classmethod
-    def of(cls, source: Description | int, *, on_paper: bool = False, n_rings: int = 1) -> Self:
+    def of(cls, source: Description | int, *, on_paper: bool = False) -> Self:
         """Makes a palette with a description's colours, or for a number of observed values.
 
         Without a description, eight colours are repeated in turn. `on_paper` prefers a light colour
-        for unobserved cells, like the page around them. With `n_rings` observation matrices, the
-        observed values of each matrix have the colours of the first one.
+        for unobserved cells, like the page around them.
         """
         if isinstance(source, Description):
-            states, n_observations = source.state_colors, source.n_observations
-            colors = source.observation_colors
+            states, observations = source.state_colors, source.observation_colors
         else:
             # Enough colours for any number of states.
             states = tuple(map(color_from_hex, islice(cycle(_COLORS), MAX_VALUES)))
-            n_observations, colors = source, states
-        observations = (colors[: n_observations // n_rings] * n_rings)[:n_observations]
+            observations = states[:source]
         return cls(
             states=states,
             observations=observations,

@@ -31,9 +31,6 @@ _Cell = TypeVar("_Cell", bound=np.generic)
 class Scenery:
     """The zones and no-fly cells of a grid, and the range of the sensor. Empty by default."""
 
-    n_rings: int = 1
-    """Number of observation matrices. All matrices have the same observations, in the same
-    colours."""
     sees_beyond: bool = False
     """Whether robots see cells beyond their path."""
     no_fly: NDArray[np.bool_] | None = None
@@ -46,7 +43,7 @@ class Scenery:
     @classmethod
     def of(cls, air: Airspace, land: Zones | None) -> Self:
         """Makes the scenery of an airspace and the zones of its land."""
-        common = cls(n_rings=air.n_rings, sees_beyond=air.radius > 0, no_fly=air.no_fly)
+        common = cls(sees_beyond=air.radius > 0, no_fly=air.no_fly)
         if land is None:
             return common
         colors = tuple(map(color_from_hex, land.colors))

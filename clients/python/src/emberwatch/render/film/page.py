@@ -66,9 +66,8 @@ class Page:
         self._room = max(_LEAST_ROOM, self._grid[1])
         self._scenery = scenery = Scenery.of(server.airspace, server.zones)
         source = described or server.n_observations
-        palette = Palette.of(source, on_paper=True, n_rings=scenery.n_rings)
-        n_named = server.n_observations // scenery.n_rings
-        names = (described.state_names if described else (), server.observations[:n_named])
+        palette = Palette.of(source, on_paper=True)
+        names = (described.state_names if described else (), server.observations)
         self._panels = _panels(palette, names, model, scenery, has_truth=has_truth)
         self.palette = _film_palette(palette, scenery)
         n_panels = len(self._panels)
