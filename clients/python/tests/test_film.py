@@ -11,7 +11,7 @@ import pytest
 from headers import header
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
-from test_recording import FILE_HEADER, deflated, packed
+from test_recording import FILE_HEADER, OLD, deflated, packed
 
 from emberwatch.belief import Belief, known, uniform_prior
 from emberwatch.client import wire
@@ -217,6 +217,14 @@ def test_recorded_worlds_have_the_colours_of_their_description(studio: Studio) -
     assert (cells(image, 1)[seen] == colors[SEEN[seen]]).all()
 
 
+def test_a_recording_of_release_0_2_is_drawn_with_its_belief(tmp_path: Path) -> None:
+    film = tmp_path / "old.png"
+    main([str(OLD), "--step", "8", "--prior", "uniform", "--scale", "10", "--out", str(film)])
+    with Image.open(film) as image:
+        assert image.width == 14 + 4 * (160 + 16) - 16 + 14
+    # Truth, frame, belief and entropy: four panels.
+
+
 def test_a_cut_recording_is_shown_up_to_the_cut(studio: Studio) -> None:
     words = studio.film([server(), frame(0), frame(1), frame(2)], cut=True)
     assert "warning" in words and "cut short" in words
@@ -293,11 +301,9 @@ def test_zones_no_fly_cells_and_footprints_are_drawn(studio: Studio) -> None:
     zone_map = [[0] * WIDTH, [0] * WIDTH, [1] * WIDTH]
     zones = {"names": ["grass", "town"], "colors": ["#00ff00", "#ff00ff"], "map": zone_map}
     no_fly = [[0, 0, 0, 0, 1]] * HEIGHT
-    airspace = {"radius": 1, "n_rings": 2, "pays": "visited", "no_fly": no_fly}
-    names = [*MODEL.observation_names, *(f"{name} ring 1" for name in MODEL.observation_names)]
-    rings = {"model": None, "observations": names, "n_observations": 6}
+    airspace = {"radius": 1, "no_fly": no_fly}
     plain = studio.still([server(model=None), *both(1)])
-    land = [server(**rings, airspace=airspace, zones=zones), *both(1)]
+    land = [server(model=None, airspace=airspace, zones=zones), *both(1)]
     image = studio.still(land)
     rows = TOP + SCALE * np.arange(HEIGHT) + 6
     unseen = image[rows, LEFTS[1] + SCALE * 2 + 5]

@@ -16,10 +16,14 @@ from headers import header
 from emberwatch.client import recording, wire
 from emberwatch.client.observer import Frame, Truth
 from emberwatch.client.recording import Record, RecordingCutWarning, RecordingDamagedWarning
+from emberwatch.model import Model
+from emberwatch.model.airspace import Airspace
 
 INFO = document.examples()[1] | {"n_robots": 2, "deadline_millis": 0}
 TOTALS = {"n_servers": 1, "n_frames": 2, "n_truths": 1, "n_lost_frames": 3, "n_lost_truths": 0}
-FILE_HEADER = struct.pack("=8sII", b"EMBERREC", 2, 0)
+#: A recording of release 0.2, whose protocol has version 2.
+OLD = Path(__file__).parents[3] / "tests/data/version-2.recording"
+FILE_HEADER = struct.pack("=8sII", b"EMBERREC", 3, 0)
 
 
 def deflated(body: bytes) -> bytes:
@@ -79,6 +83,22 @@ def test_a_recording_is_read_in_order_with_lost_samples(path: Path) -> None:
     assert hidden.sample.step == 7 and not hidden.sample.states.any()
     flew.frame[:] = 1  # the caller may write to it
     assert list(recording.read(path, world=1)) == []
+
+
+def test_recordings_of_release_0_2_are_read_unless_their_sensor_has_rings(path: Path) -> None:
+    good = OLD.read_bytes()
+    frames = [it for it in read(path, good, strict=True) if isinstance(it.sample, Frame)]
+    assert len(frames) == 10 and frames[-1].sample.result.step == 8
+    server = frames[0].server
+    assert server.airspace == Airspace(radius=1) and server.protocol == 2
+    assert server.model is not None and Model.from_toml(server.model).sensor_radius == 1
+    (length,) = struct.unpack_from("=I", good, 28)
+    info = json.loads(zlib.decompress(good[40 : 40 + length], -15))
+    for change in ({"n_rings": 2}, {"pays": "seen"}):
+        changed = info | {"airspace": info["airspace"] | change}
+        record = packed(1, deflated(json.dumps(changed).encode()), nanos=0)
+        words = "expected a sensor with one observation matrix, and rewards for visited cells, got"
+        refused(path, good[:16] + record + good[40 + length :], words)
 
 
 def test_damaged_recordings_are_read_to_the_last_good_record(path: Path) -> None:
