@@ -50,7 +50,6 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     for (name, words) in [
         ("ladder.svg", ">beam exploit"),
         ("rewards.svg", ">beam exploit"),
-        ("snapshot.svg", ">wildfire, step k"),
         ("agent.toml", "beam_width = 4"),
     ] {
         let text = folder.text(&format!("figures/{name}"));
@@ -72,7 +71,7 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
 fn a_comparison_repeats_to_the_bit_on_any_server() {
     let first = compare(WORLDS);
     assert_eq!(compare(WORLDS), first);
-    let roomy = format!("{WORLDS} --publish-truth --coverage client --seed 77");
+    let roomy = format!("{WORLDS} --publish-truth --seed 77");
     for n_worlds in [5, 2] {
         let server = Server::start(&format!("{roomy} --worlds {n_worlds} --threads 2"));
         for _ in 0..2 {
@@ -133,7 +132,7 @@ fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
             .sum::<f64>()
     };
     assert!(distinct("joint") > distinct("alone"), "{rows:?}");
-    let flags = "--robots 3 --publish-truth --coverage client";
+    let flags = "--robots 3 --publish-truth";
     let server = Server::start(&format!("{LIVELY} {flags}"));
     let joint = compare(&format!(
         "--team joint --instance {}",
@@ -181,12 +180,10 @@ fn a_second_model_runs_from_end_to_end() {
         Program::agent(&server.instance, flags).ends(0);
     }
     assert_eq!(server.step_of(0), 40);
-    let figures = Folder::default();
-    let rows = compare(&format!("{flags} --figures {}", figures.word("figures")));
+    let rows = compare(&flags);
     // The default comparison has fifteen policies here, because it has one policy for each of the three states without
     // a reward.
     assert_eq!(rows.len(), 15 * 2, "{rows:?}");
-    assert!(figures.path("figures/snapshot.svg").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
     let flags = format!("--steps 3 --beam-width 5 {model}");
     Program::agent(&hidden.instance, &flags).ends(0);

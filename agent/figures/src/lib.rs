@@ -1,7 +1,7 @@
 //! Draws charts as SVG. The same data give the same SVG on every machine.
 //!
-//! [`Ladder`] draws bars, [`Lines`] curves over a common axis, and [`Snapshot`] the cells of one step. `svg` contains
-//! the drawing functions, and `axis` the scales. [`heat`] creates PNGs for TensorBoard, which cannot show SVG.
+//! [`Ladder`] draws bars, and [`Lines`] curves over a common axis. `svg` contains the drawing functions, and `axis` the
+//! scales. [`heat`] creates PNGs for TensorBoard, which cannot show SVG.
 
 #![allow(
     missing_docs,
@@ -11,17 +11,12 @@
 mod axis;
 mod heat;
 mod ladder;
-mod legend;
 mod lines;
 mod palette;
-mod panels;
-mod snapshot;
 mod svg;
 mod text;
 
 pub use heat::{Heat, heat};
 pub use ladder::{Bar, Ladder};
-pub use legend::Named;
 pub use lines::{Curve, Lines, MAX_CURVES, Panel, Scale, Shade};
 pub use palette::Color;
-pub use snapshot::Snapshot;

@@ -50,12 +50,6 @@ const SEQUENTIAL: [Color; 9] = [
     Color(0x08, 0x1d, 0x58),
 ];
 
-/// Candidate greys for "not observed", in order of preference.
-const NEUTRALS: [u8; 4] = [0xe2, 0xb8, 0x80, 0x48];
-
-/// Squared RGB distance at which two colours are clearly distinguishable: 60 of 255 in each channel.
-const APART: i32 = 3 * 60 * 60;
-
 /// Returns the colour of a probability, light for 0 and NaN. Values outside of `0..=1` are clamped.
 pub fn sequential(probability: f32) -> Color {
     let last = SEQUENTIAL.len() - 1;
@@ -69,19 +63,6 @@ pub fn sequential(probability: f32) -> Color {
     blend(SEQUENTIAL[below], SEQUENTIAL[below + 1], at - below as f64)
 }
 
-/// Returns the first candidate grey that is clearly distinguishable from all given colours. If there is none, returns
-/// the most distant candidate.
-pub fn unlike(colors: &[Color]) -> Color {
-    let grey = |level: u8| Color(level, level, level);
-    let nearest = |level: u8| {
-        let distances = colors.iter().map(|&color| distance(color, grey(level)));
-        distances.min().unwrap_or(i32::MAX)
-    };
-    let apart = NEUTRALS.into_iter().find(|&level| nearest(level) >= APART);
-    let level = apart.or_else(|| NEUTRALS.into_iter().max_by_key(|&level| nearest(level)));
-    grey(level.expect("invariant: there are neutrals"))
-}
-
 /// Mixes two colours. The result is `from` if `fraction` is 0, and `to` if it is 1.
 pub fn blend(from: Color, to: Color, fraction: f64) -> Color {
     let channel = |from: u8, to: u8| {
@@ -93,11 +74,6 @@ pub fn blend(from: Color, to: Color, fraction: f64) -> Color {
         channel(from.1, to.1),
         channel(from.2, to.2),
     )
-}
-
-fn distance(a: Color, b: Color) -> i32 {
-    let channel = |a: u8, b: u8| (i32::from(a) - i32::from(b)).pow(2);
-    channel(a.0, b.0) + channel(a.1, b.1) + channel(a.2, b.2)
 }
 
 #[cfg(test)]
@@ -116,12 +92,5 @@ mod tests {
         }
         assert_eq!(sequential(7.0), SEQUENTIAL[8]);
         assert_eq!(sequential(f32::NAN), SEQUENTIAL[0]);
-    }
-
-    #[test]
-    fn the_unobserved_grey_avoids_the_states() {
-        assert_eq!(unlike(&[Color(0, 0, 0)]), Color(0xe2, 0xe2, 0xe2));
-        let greys = [Color(0xff, 0xff, 0xff), Color(0xb0, 0xb0, 0xb0)];
-        assert_eq!(unlike(&greys), Color(0x48, 0x48, 0x48));
     }
 }

@@ -13,9 +13,6 @@ pub const MARGIN: f64 = 32.0;
 /// A position in points: distance from the left edge, and from the upper edge.
 pub type Point = (f64, f64);
 
-/// A row of adjacent squares: the upper left corner of the first square, and the number of squares.
-pub type Run = (Point, usize);
-
 /// The text anchor: which part of a text (start, middle or end) is placed at the given horizontal position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Align {
@@ -74,14 +71,6 @@ impl Svg {
         }
     }
 
-    /// Draws the outline of a rectangle, inside its bounds.
-    pub fn outline(&mut self, from: Point, to: Point, width: f64, color: Color) {
-        self.rectangle(from, (to.0, from.1 + width), color);
-        self.rectangle((from.0, to.1 - width), to, color);
-        self.rectangle(from, (from.0 + width, to.1), color);
-        self.rectangle((to.0 - width, from.1), to, color);
-    }
-
     /// Draws a horizontal or vertical line.
     pub fn rule(&mut self, from: Point, to: Point, width: f64, color: Color) {
         let half = width / 2.0;
@@ -111,18 +100,6 @@ impl Svg {
         let (x, y) = (short(x), short(y));
         self.add(format_args!(
             "<circle cx=\"{x}\" cy=\"{y}\" r=\"{radius}\" fill=\"{color}\"/>"
-        ));
-    }
-
-    pub fn squares(&mut self, runs: &[Run], side: f64, color: Color) {
-        let mut path = String::new();
-        for &((x, y), n) in runs {
-            let width = side * n as f64;
-            // Writing to a string cannot fail.
-            let _ = write!(path, "M{x} {y}h{width}v{side}h-{width}z");
-        }
-        self.add(format_args!(
-            "<path fill=\"{color}\" shape-rendering=\"crispEdges\" d=\"{path}\"/>"
         ));
     }
 

@@ -48,7 +48,6 @@ pub struct TextStyle {
 impl TextStyle {
     pub const TITLE: Self = Self::new(20.0, true, INK);
     pub const LABEL: Self = Self::new(14.0, false, INK);
-    pub const STRONG: Self = Self::new(14.0, true, INK);
     pub const NOTE: Self = Self::new(13.0, false, MUTED);
 
     const fn new(size: f64, is_bold: bool, color: Color) -> Self {
@@ -132,7 +131,14 @@ mod tests {
         assert_eq!(style.fit(text, 1000.0), text);
         assert_eq!(style.fit(text, 0.0), "");
         // Widths of a digit, a space and an A in thousandths: regular 572, 260 and 639, bold 572, 260 and 690.
-        let [regular, bold] = [TextStyle::LABEL, TextStyle::STRONG].map(|style| style.width("0 A"));
+        let [regular, bold] = [
+            TextStyle::LABEL,
+            TextStyle {
+                is_bold: true,
+                ..TextStyle::LABEL
+            },
+        ]
+        .map(|style| style.width("0 A"));
         assert!((regular - 14.0 * 1.471).abs() < 1e-9 && (bold - 14.0 * 1.522).abs() < 1e-9);
     }
 }

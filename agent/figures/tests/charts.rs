@@ -1,9 +1,6 @@
 //! Charts of unusual data: they must be valid XML, and all text must be on the page.
 
-use emberwatch_figures::{
-    Bar, Color, Curve, Ladder, Lines, MAX_CURVES, Named, Panel, Scale, Shade, Snapshot,
-};
-use ndarray::{Array2, Array3};
+use emberwatch_figures::{Bar, Color, Curve, Ladder, Lines, MAX_CURVES, Panel, Scale, Shade};
 use roxmltree::Document;
 
 const BLUE: Color = Color(0x00, 0x72, 0xb2);
@@ -160,69 +157,6 @@ fn extra_curves_are_omitted_and_single_points_are_drawn() {
         assert!(texts.contains(&format!("curve {}", MAX_CURVES - 1)));
         assert!(!texts.contains(&format!("curve {MAX_CURVES}")));
         assert!(svg.matches("<circle").count() >= MAX_CURVES);
-    }
-}
-
-/// The states of a grid, a frame, and a belief.
-struct Step {
-    truth: Array2<u8>,
-    frame: Array2<u8>,
-    belief: Array3<f32>,
-}
-
-fn step(height: usize, width: usize) -> Step {
-    let value = |(row, col): (usize, usize)| ((row * 7 + col * 3) % 5 % 3) as u8;
-    let truth = Array2::from_shape_fn((height, width), value);
-    Step {
-        frame: truth.mapv(|value| if value == 0 { 255 } else { value }),
-        belief: Array3::from_shape_fn((3, height, width), |(_, row, col)| {
-            (row + col) as f32 / (height + width) as f32
-        }),
-        truth,
-    }
-}
-
-fn snapshot(step: &Step) -> Snapshot<'_> {
-    let colors = [BLUE, Color(230, 180, 60), Color(200, 50, 30)];
-    let names = ["normal", "latent", "fire"].map(String::from);
-    let named = names.clone().into_iter().zip(colors);
-    let named: Vec<_> = named.map(|(name, color)| Named { name, color }).collect();
-    Snapshot {
-        title: "wildfire, step k = 4".into(),
-        note: "world seed 7".into(),
-        states: named.clone(),
-        observations: named,
-        truth: step.truth.view(),
-        observation: step.truth.view(),
-        frame: step.frame.view(),
-        path: vec![(0, 0), (step.truth.nrows() - 1, 0)],
-        beliefs: names.into_iter().zip(step.belief.outer_iter()).collect(),
-    }
-}
-
-#[test]
-fn snapshots_show_each_cell_in_its_colour() {
-    for (height, width) in [(1, 1), (5, 40), (40, 5), (300, 500)] {
-        let step = step(height, width);
-        let mut page = snapshot(&step);
-        let texts = check(&page.svg());
-        assert!(texts.contains(&"belief: fire".into()));
-        page.path.clear();
-        page.beliefs.clear();
-        let texts = check(&page.svg());
-        assert!(!texts.iter().any(|text| text.starts_with("belief")));
-    }
-    let step = step(2, 3);
-    assert_eq!(step.truth, ndarray::arr2(&[[0, 0, 1], [2, 0, 0]]));
-    let svg = snapshot(&step).svg();
-    let document = Document::parse(&svg).expect("XML");
-    // In the first panel (the truth), adjacent cells of the same colour in a row form one rectangle.
-    for (color, n_rectangles) in [("#0072b2", 2), ("#e6b43c", 1), ("#c8321e", 1)] {
-        let is_of = |fill| fill == Some(color);
-        let mut all = document.descendants().filter(|it| it.has_tag_name("path"));
-        let squares = all.find(|it| is_of(it.attribute("fill"))).expect(color);
-        let path = squares.attribute("d").expect("a path");
-        assert_eq!(path.matches('M').count(), n_rectangles, "{color}");
     }
 }
 

@@ -1,7 +1,4 @@
 //! The worlds on which policies are compared, the same for all policies.
-//!
-//! One server's worlds form two groups: the *main* worlds, on which policies act; and one *spare*, for full
-//! observations.
 
 use crate::acting::mission::{check_recorded, needs_model, recorded_states};
 use crate::benchmark::team::Team;
@@ -18,12 +15,12 @@ use emberwatch_learning::rollout::agent::Agent;
 use emberwatch_learning::rollout::{Environment, Seen, building};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
-use emberwatch_protocol::control::{CoverageRule, ServerInfo, WorldSeed};
+use emberwatch_protocol::control::{ServerInfo, WorldSeed};
 use emberwatch_protocol::{Client, Grid, Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
-/// Maximum number of main worlds in a batch. With a spare, their hidden states fit a reader's buffer.
+/// Maximum number of worlds in a batch. Their hidden states fit a reader's buffer.
 pub const MAX_BATCH: u32 = 32;
 
 /// Time to live of an unused lease on a comparison's worlds.
@@ -39,23 +36,22 @@ pub struct Arena {
     model: Model,
     /// The model with which beliefs predict recorded worlds, if one was given.
     known: Option<Model>,
-    main: Range<u32>,
-    spare: Option<u32>,
+    /// Number of worlds, which is the number of seeds that run at a time.
+    n_worlds: u32,
     /// Number of robots per agent: one, or all robots of a world.
     crew: usize,
 }
 
 impl Arena {
-    /// Acquires up to `n_seeds` main worlds, and a spare if there is one.
+    /// Acquires up to `n_seeds` worlds.
     pub fn open(instance: &Instance, n_seeds: u32) -> Result<Self> {
         let unfit =
             |needs: &str| format!("instance {:?}: comparing needs {needs}", instance.name());
         let connection = connect(instance)?;
         let (n_worlds, team) = (connection.info().n_worlds, connection.info().n_robots);
-        let n_main = n_worlds.min(n_seeds).min(MAX_BATCH);
-        let spare = (n_worlds > n_main).then_some(n_main);
+        let n_worlds = n_worlds.min(n_seeds).min(MAX_BATCH);
         let claim = Claim {
-            robots: 0..(n_main + u32::from(spare.is_some())) * team,
+            robots: 0..n_worlds * team,
             takeover: false,
             // The time to live is long, because simulating the prior can take long. Closing the connection still ends
             // the lease at once.
@@ -80,18 +76,13 @@ impl Arena {
             truth,
             model,
             known: None,
-            main: 0..n_main,
-            spare,
+            n_worlds,
             crew: 1,
         })
     }
 
     pub fn instance(&self) -> &Instance {
         &self.instance
-    }
-
-    pub fn worlds(&self) -> Range<u32> {
-        self.main.clone()
     }
 
     pub fn model(&self) -> &Model {
@@ -130,9 +121,9 @@ impl Arena {
         self.truth.is_some()
     }
 
-    /// Returns the number of main worlds, which is the number of seeds that run at a time.
+    /// Returns the number of seeds that run at a time.
     pub fn batch_size(&self) -> usize {
-        self.main.len()
+        self.n_worlds as usize
     }
 
     pub fn n_robots(&self) -> usize {
@@ -150,51 +141,27 @@ impl Arena {
         self.n_robots() / self.crew
     }
 
-    /// Starts the main worlds with these seeds; returns what agents see at k = 0, by world.
+    /// Starts worlds with these seeds; returns what agents see at k = 0, by world.
     pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>> {
-        let orders = seeds.iter().zip(self.main.start..);
+        let orders = seeds.iter().zip(0..);
         let orders = orders.map(|(&seed, world)| WorldSeed {
             world,
             seed: Some(seed),
         });
         self.client.reset(&orders.collect::<Vec<_>>())?;
-        let truth = self.states(self.range(&self.main, seeds), seeds, 0)?;
-        let robots = self.robots(&self.range(&self.main, seeds));
+        let truth = self.states(seeds, 0)?;
+        let robots = self.robots(seeds);
         let observations = self.client.observe(robots)?;
         Ok(self.seen(observations, &truth))
     }
 
-    /// Returns the main worlds of these seeds as an environment whose next step is `step`.
+    /// Returns the worlds of these seeds as an environment whose next step is `step`.
     pub fn batch<'a>(&'a mut self, seeds: &'a [u64], step: u64) -> Batch<'a> {
         Batch {
             arena: self,
             seeds,
             step,
         }
-    }
-
-    /// Returns what a robot that sees every cell would have observed in a seed's world at `step`, which is at least 1.
-    /// Returns `None` if the server has no spare world or does not serve full frames.
-    pub fn full_observation(&mut self, seed: u64, step: u64) -> Result<Option<Grid<u8>>> {
-        let Some(spare) = self
-            .spare
-            .filter(|_| self.info().coverage != CoverageRule::Path)
-        else {
-            return Ok(None);
-        };
-        self.client.reset(&[WorldSeed {
-            world: spare,
-            seed: Some(seed),
-        }])?;
-        let robots = self.robots(&(spare..spare + 1));
-        let paths = vec![self.any_path(); robots.len()];
-        for _ in 1..step {
-            self.client.step(robots.clone(), &paths)?;
-        }
-        let seen = self.client.step_full(robots, &paths)?;
-        Ok(seen
-            .first()
-            .map(|observation| observation.frame.values().to_owned()))
     }
 
     /// Creates a policy's agent for the world of a seed. `number` is the agent's index in the world.
@@ -226,31 +193,18 @@ impl Arena {
         Ok(())
     }
 
-    /// Returns the hidden states of worlds at a step, or `None` for each world if they are not published.
-    fn states(
-        &self,
-        worlds: Range<u32>,
-        seeds: &[u64],
-        step: u64,
-    ) -> Result<Vec<Option<Grid<u8>>>> {
+    /// Returns the hidden states of the worlds of these seeds at a step, or `None` for each world if they are not
+    /// published.
+    fn states(&self, seeds: &[u64], step: u64) -> Result<Vec<Option<Grid<u8>>>> {
         let Some(truth) = &self.truth else {
-            return Ok(vec![None; worlds.len()]);
+            return Ok(vec![None; seeds.len()]);
         };
-        let states = truth.states(worlds, seeds, step)?;
+        let states = truth.states(0..seeds.len() as u32, seeds, step)?;
         Ok(states.into_iter().map(Some).collect())
     }
 
-    fn any_path(&self) -> Vec<Move> {
-        vec![Move::Up; self.info().n_moves]
-    }
-
-    fn range(&self, worlds: &Range<u32>, seeds: &[u64]) -> Range<u32> {
-        worlds.start..worlds.start + seeds.len() as u32
-    }
-
-    fn robots(&self, worlds: &Range<u32>) -> Range<u32> {
-        let team = self.info().n_robots;
-        worlds.start * team..worlds.end * team
+    fn robots(&self, seeds: &[u64]) -> Range<u32> {
+        0..seeds.len() as u32 * self.info().n_robots
     }
 
     fn seen(&self, observations: Vec<Observation>, truths: &[Option<Grid<u8>>]) -> Vec<Seen> {
@@ -264,7 +218,7 @@ impl Arena {
     }
 }
 
-/// Main worlds of an arena as an environment. Observations are ordered by world.
+/// Worlds of an arena as an environment. Observations are ordered by world.
 pub struct Batch<'a> {
     arena: &'a mut Arena,
     seeds: &'a [u64],
@@ -274,9 +228,8 @@ pub struct Batch<'a> {
 impl Environment for Batch<'_> {
     fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>> {
         let arena = &mut *self.arena;
-        let worlds = arena.range(&arena.main, self.seeds);
-        let observations = arena.client.step(arena.robots(&worlds), paths)?;
-        let truth = arena.states(worlds, self.seeds, self.step)?;
+        let observations = arena.client.step(arena.robots(self.seeds), paths)?;
+        let truth = arena.states(self.seeds, self.step)?;
         Ok(Some(arena.seen(observations, &truth)))
     }
 }

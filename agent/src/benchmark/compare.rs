@@ -1,7 +1,7 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
 use crate::benchmark::arena::Arena;
-use crate::benchmark::report::{PolicyRun, Snapshot};
+use crate::benchmark::report::PolicyRun;
 use crate::benchmark::team::Team;
 use crate::benchmark::world_run::WorldRun;
 use crate::client::view::view;
@@ -51,8 +51,6 @@ pub struct Results {
     pub runs: Vec<PolicyRun>,
     /// Number of cells in the state with the highest reward, per step, averaged over worlds. The same for all policies.
     pub fire_cells: Vec<f32>,
-    /// The last step of the first world's first robot, from the last policy with the highest [`Snapshot::rank`].
-    pub snapshot: Option<Snapshot>,
 }
 
 /// One policy with one kind of team.
@@ -79,7 +77,6 @@ pub fn compare(
     let mut results = Results {
         runs: Vec::new(),
         fire_cells: Vec::new(),
-        snapshot: None,
     };
     let mut feed = Feed::open(arena.instance(), prior.probabilities());
     let contestants = comparison.contestants(arena.model());
@@ -98,15 +95,10 @@ pub fn compare(
         for batch in seeds.chunks(arena.batch_size()) {
             let game = game(contestant, batch);
             let runs = game.play(arena, &mut feed, progress);
-            let mut worlds =
-                runs.with_context(|| format!("policy {:?}", contestant.policy.name))?;
+            let worlds = runs.with_context(|| format!("policy {:?}", contestant.policy.name))?;
             if *contestant == contestants[0] {
                 let share = 1.0 / seeds.len() as f32;
                 results.add_fire(share, &worlds);
-            }
-            if batch[0] == comparison.seeds.start {
-                let both = [results.snapshot, worlds[0].snapshot.take()];
-                results.snapshot = both.into_iter().flatten().max_by_key(Snapshot::rank);
             }
             let model = arena.known_model();
             let fingerprint = comparison.policy_fingerprint(&contestant.policy, model);
@@ -203,7 +195,6 @@ impl Match<'_> {
         arena.fly_as(self.contestant.team);
         let mut players = self.start(arena, feed)?;
         for step in 1..=self.comparison.steps {
-            players.is_last = step == self.comparison.steps;
             rollout::step(&mut players, &mut arena.batch(self.seeds, step))?;
             progress(&self.contestant.policy.name, players.worlds.len() as u64);
         }
@@ -226,9 +217,7 @@ impl Match<'_> {
             worlds: self.seeds.iter().map(world).collect(),
             plans: Vec::new(),
             target,
-            first_world: arena.worlds().start,
             n_robots: arena.n_robots(),
-            is_last: false,
             feed,
         })
     }
@@ -263,10 +252,8 @@ struct Players<'a> {
     plans: Vec<(Vec<Plan>, Duration)>,
     /// The state with the highest reward.
     target: usize,
-    first_world: u32,
     /// Number of robots per world.
     n_robots: usize,
-    is_last: bool,
     feed: &'a mut Feed,
 }
 
@@ -304,9 +291,6 @@ impl Players<'_> {
             world.count(rollout, plans, self.n_robots);
             if index % n_agents == 0 {
                 world.score(rollout, self.target, record.score);
-                if self.is_last {
-                    world.snapshot = world.snapshot(rollout, record, plans);
-                }
             }
         }
     }
@@ -316,8 +300,8 @@ impl Players<'_> {
         let (n_agents, n_robots) = (self.n_agents(), self.n_robots as u32);
         let crew = n_robots / n_agents as u32;
         for index in self.feed.due(self.rollouts.len()) {
-            let world = self.first_world + (index / n_agents) as u32;
-            let robot = self.first_world * n_robots + index as u32 * crew;
+            let world = (index / n_agents) as u32;
+            let robot = index as u32 * crew;
             let (rollout, (_, time)) = (&self.rollouts[index], &self.plans[index]);
             let view = view(rollout, world, robot..robot + crew, *time);
             self.feed.show(&view);

@@ -1,6 +1,6 @@
 //! Measures one world's run: scores the flights and beliefs of each step, and sums them up in a row of the results.
 
-use crate::benchmark::report::{PolicyRun, Snapshot};
+use crate::benchmark::report::PolicyRun;
 use crate::benchmark::team::Team;
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::scoring::Score;
@@ -8,7 +8,7 @@ use emberwatch_belief::merit::{Found, MeritTally};
 use emberwatch_belief::planning::Plan;
 use emberwatch_learning::beliefs::Input;
 use emberwatch_learning::policy::Policy;
-use emberwatch_learning::rollout::{Rollout, StepRecord};
+use emberwatch_learning::rollout::Rollout;
 use emberwatch_protocol::Shape;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::WorldResult;
@@ -22,7 +22,6 @@ pub struct WorldRun {
     /// Flights of the present step, collected until all robots have flown.
     flights: Vec<Flight>,
     merit: MeritTally,
-    pub snapshot: Option<Snapshot>,
 }
 
 /// Sums over the steps of a run.
@@ -51,7 +50,6 @@ impl WorldRun {
             tally: Tally::default(),
             flights: Vec::new(),
             merit: MeritTally::new(shape, target as u8, recent_steps),
-            snapshot: None,
         }
     }
 
@@ -82,30 +80,6 @@ impl WorldRun {
             .map(|truth| brier_score(agent.belief(), truth, target, agent.target()));
         self.tally.add(&rollout.observation().world, brier);
         self.tally.score += score.unwrap_or_default();
-    }
-
-    /// Returns a snapshot of a step; `None` if hidden states are not published.
-    pub fn snapshot(
-        &self,
-        rollout: &Rollout,
-        record: &StepRecord,
-        plans: &[Plan],
-    ) -> Option<Snapshot> {
-        let (agent, observation) = (&rollout.agent, rollout.observation());
-        let (airspace, start) = (agent.airspace(), record.before.robot.cell());
-        let belief = agent.policy().belief;
-        let moves = &plans[0].moves;
-        let mut path_cells = vec![start];
-        path_cells.extend((1..=moves.len()).map(|n| airspace.fly(start, &moves[..n]).end));
-        Some(Snapshot {
-            seed: self.seed,
-            step: observation.world.step,
-            truth: rollout.truth()?.clone(),
-            frame: observation.frame.clone(),
-            path_cells,
-            belief: (belief.input == Input::Frames).then(|| agent.belief().clone()),
-            learned_target: belief.learned_by.is_some().then(|| agent.target()),
-        })
     }
 
     /// Summarises the run as a row of the results.

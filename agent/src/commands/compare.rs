@@ -7,8 +7,8 @@ use crate::benchmark::compare::{Comparison, Results, compare};
 use crate::benchmark::report::common_worlds::{CommonWorlds, check_added, check_fire};
 use crate::benchmark::report::runs_file::read_runs;
 use crate::benchmark::report::{
-    PolicyRun, RunsFile, draw_ladder, draw_rewards, draw_snapshot, draw_teams,
-    figures::FIRE_CELLS_PER_STEP, render_table, write_events,
+    PolicyRun, RunsFile, draw_ladder, draw_rewards, draw_teams, figures::FIRE_CELLS_PER_STEP,
+    render_table, write_events,
 };
 use crate::benchmark::team::Team;
 use crate::client::launch::OwnDashboard;
@@ -67,7 +67,7 @@ pub struct CompareCommand {
     /// may be given several times
     #[arg(long, value_name = "FILE")]
     add: Vec<PathBuf>,
-    /// Draw ladder.svg, rewards.svg, teams.svg and snapshot.svg into this directory
+    /// Draw ladder.svg, rewards.svg and teams.svg into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Show the running comparison in a browser, at this address
@@ -129,9 +129,6 @@ impl CompareCommand {
             };
             self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
-            if let Some(directory) = &self.figures {
-                draw_step(directory, arena, &results)?;
-            }
             let policies = &comparison.policies;
             report.baseline = self.baseline(arena.model(), arena.lacks_model(), policies)?;
             report.add(axis_label(arena.model()), results);
@@ -363,25 +360,6 @@ pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Resu
     });
     bar.finish_and_clear();
     results
-}
-
-/// Draws a snapshot of a world with one robot. Draws nothing if worlds have several robots.
-fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<()> {
-    if arena.n_robots() > 1 {
-        return Ok(());
-    }
-    let Some(snapshot) = &results.snapshot else {
-        tracing::warn!("no snapshot: it needs hidden states, from a server with --publish-truth");
-        return Ok(());
-    };
-    let Some(observation) = arena.full_observation(snapshot.seed, snapshot.step)? else {
-        tracing::warn!(
-            "no snapshot: it needs a server with --coverage client and one more world than seeds"
-        );
-        return Ok(());
-    };
-    let path = directory.join("snapshot.svg");
-    draw_snapshot(&path, arena.model(), snapshot, &observation)
 }
 
 fn axis_label(model: &Model) -> String {

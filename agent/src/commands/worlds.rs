@@ -163,11 +163,10 @@ impl WorldFlags {
     }
 
     fn server_arguments(&self) -> Vec<String> {
-        let worlds = self.n_seeds().min(MAX_BATCH) + 1;
+        let worlds = self.n_seeds().min(MAX_BATCH);
         let burn_in = self.burn_in.unwrap_or(BENCHMARK_BURN_IN);
         let mut arguments = self.grid.arguments(worlds, self.seeds().start, burn_in);
-        let rest = ["--coverage", "client", "--publish-truth"];
-        arguments.extend(rest.map(String::from));
+        arguments.push("--publish-truth".into());
         arguments
     }
 }

@@ -3,12 +3,7 @@
 use super::synthetic::{ladder, noise, run, teams};
 use emberwatch_agent::benchmark::report::figures::FIRE_CELLS_PER_STEP as LABEL;
 use emberwatch_agent::benchmark::report::training::{FIGURE, draw_training};
-use emberwatch_agent::benchmark::report::{
-    Snapshot, draw_ladder, draw_rewards, draw_snapshot, draw_teams,
-};
-use emberwatch_belief::Belief;
-use emberwatch_protocol::randomness::split_mix;
-use emberwatch_protocol::{Cell, Frame, Grid, Model, Shape};
+use emberwatch_agent::benchmark::report::{draw_ladder, draw_rewards, draw_teams};
 use std::path::{Path, PathBuf};
 
 fn target(name: &str) -> PathBuf {
@@ -54,37 +49,6 @@ fn pages_have_their_size_and_labels() {
     let never = target("teams_never");
     draw_teams(&never, &ladder(2, 4), LABEL).expect("nothing to draw");
     assert!(!never.exists());
-}
-
-#[test]
-fn a_snapshot_calls_the_beliefs_states_by_their_names() {
-    let (model, shape) = (Model::wildfire(), Shape::new(30, 48).expect("test shape"));
-    let truth = Grid::from_shape_fn(shape.dim(), |(row, col)| {
-        (split_mix(3, (row / 4 * 12 + col / 4) as u64) % 3) as u8
-    });
-    let path_cells: Vec<Cell> = (15..25).map(|col| Cell { row: 15, col }).collect();
-    let mut frame = Frame::empty(shape);
-    for cell in &path_cells[1..] {
-        frame.observe(shape.index(*cell), truth[[cell.row, cell.col]]);
-    }
-    let mut snapshot = Snapshot {
-        seed: 100,
-        step: 1234,
-        belief: Some(Belief::from_states(&truth, 3).expect("states of the model")),
-        truth: truth.clone(),
-        frame,
-        path_cells,
-        learned_target: None,
-    };
-    let path = target("snapshot");
-    for (learned_target, name) in [(None, "fire"), (Some(2), "state that pays most")] {
-        snapshot.learned_target = learned_target;
-        draw_snapshot(&path, &model, &snapshot, &truth).expect("drawn");
-        let svg = std::fs::read_to_string(&path).expect("a file");
-        for text in [&format!("belief: {name}"), "wildfire, step k = 1234"] {
-            assert!(svg.contains(&format!(">{text}</text>")), "{text}");
-        }
-    }
 }
 
 #[test]

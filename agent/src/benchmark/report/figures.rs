@@ -6,13 +6,10 @@ use crate::benchmark::report::rewards::rewards;
 use crate::benchmark::report::statistics::Estimate;
 use crate::benchmark::report::teams::teams;
 use anyhow::{Context, Result, bail, ensure};
-use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_figures::{Bar, Color, Ladder, Named};
+use emberwatch_figures::{Bar, Color, Ladder};
 use emberwatch_learning::beliefs::{self, BELIEFS, BeliefKind, KNOWN, LEARNED};
 use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_learning::policy;
-use emberwatch_protocol::model::parse_color;
-use emberwatch_protocol::{Cell, Frame, Grid, Model, UNOBSERVED};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -24,43 +21,6 @@ const SHOOTING: (&str, Color) = ("known model, shooting", Color(0x56, 0xb4, 0xe9
 
 /// Legend and colour of rows from `--add`.
 const ADDED: (&str, Color) = ("added", Color(0xcc, 0x79, 0xa7));
-
-/// One step of one world, as a policy saw it.
-#[derive(Debug, Clone)]
-pub struct Snapshot {
-    pub seed: u64,
-    /// Step index k.
-    pub step: u64,
-    /// Hidden states, shape `[H, W]`.
-    pub truth: Grid<u8>,
-    pub frame: Frame,
-    /// The cells of the robot's path, including its start.
-    pub path_cells: Vec<Cell>,
-    /// The posterior after the frame, if frames update the policy's belief.
-    pub belief: Option<Belief>,
-    /// For a belief with learned states, the state with the highest reward. `None` if the states are the model's.
-    pub learned_target: Option<usize>,
-}
-
-impl Snapshot {
-    /// Returns how informative the snapshot is: 0 without a belief, 1 with learned states, 2 with the model's states.
-    pub fn rank(&self) -> u8 {
-        match (&self.belief, self.learned_target) {
-            (None, _) => 0,
-            (Some(_), Some(_)) => 1,
-            (Some(_), None) => 2,
-        }
-    }
-
-    /// Returns a state's name for the title of its panel.
-    fn state_name(&self, model: &Model, state: usize) -> String {
-        match self.learned_target {
-            None => model.file().states[state].name.clone(),
-            Some(target) if target == state => "state that pays most".into(),
-            Some(_) => format!("learned state {state}"),
-        }
-    }
-}
 
 /// Writes an SVG page to `path`.
 pub fn save(path: &Path, svg: &str) -> Result<()> {
@@ -231,63 +191,6 @@ pub fn draw_rewards(
     let svg = page.svg();
     let svg = svg.context("rewards: expected at least one policy run, got none")?;
     save(path, &svg)
-}
-
-/// Draws one step, with a panel for each state of the belief. `observation` is the sensor's view of the whole grid.
-pub fn draw_snapshot(
-    path: &Path,
-    model: &Model,
-    snapshot: &Snapshot,
-    observation: &Grid<u8>,
-) -> Result<()> {
-    let (file, shape) = (model.file(), snapshot.truth.dim());
-    let states = file.states.iter().map(|it| named(&it.name, &it.color));
-    let observations = file
-        .observations
-        .iter()
-        .map(|it| named(&it.name, &it.color));
-    // Observations from the sensor's outer rings have the same colours as observations on the path.
-    let n_named = file.observations.len() as u8;
-    let of_path = |value: u8| {
-        if value == UNOBSERVED {
-            value
-        } else {
-            value % n_named
-        }
-    };
-    let frame = snapshot.frame.values().mapv(of_path);
-    let belief = snapshot.belief.as_ref().map(Belief::view);
-    let beliefs = belief.iter().flat_map(|belief| belief.outer_iter());
-    let page = emberwatch_figures::Snapshot {
-        title: format!("{}, step k = {}", model.name(), snapshot.step),
-        note: format!(
-            "world seed {}, {} x {} cells",
-            snapshot.seed, shape.0, shape.1
-        ),
-        states: states.collect(),
-        observations: observations.collect(),
-        truth: snapshot.truth.view(),
-        observation: observation.view(),
-        frame: frame.view(),
-        path: snapshot
-            .path_cells
-            .iter()
-            .map(|cell| (cell.row, cell.col))
-            .collect(),
-        beliefs: beliefs
-            .enumerate()
-            .map(|(state, belief)| (snapshot.state_name(model, state), belief))
-            .collect(),
-    };
-    save(path, &page.svg())
-}
-
-fn named(name: &str, color: &str) -> Named {
-    let [red, green, blue] = parse_color(color).expect("invariant: a model's colours are checked");
-    Named {
-        name: name.into(),
-        color: Color(red, green, blue),
-    }
 }
 
 fn check_finite(run: &PolicyRun, what: &str, mut values: impl Iterator<Item = f64>) -> Result<()> {
