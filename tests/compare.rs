@@ -48,8 +48,8 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
         }
     }
     for (name, words) in [
-        ("ladder.svg", ">beam exploit"),
-        ("rewards.svg", ">beam exploit"),
+        ("ladder.svg", "\nbeam exploit"),
+        ("rewards.svg", "\nbeam exploit"),
         ("agent.toml", "beam_width = 4"),
     ] {
         let text = folder.text(&format!("figures/{name}"));

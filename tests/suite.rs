@@ -84,7 +84,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
         text.starts_with(PAGE) && text.contains("| us | here |"),
         "{text}"
     );
-    assert!(place.0.text("page.svg").contains(">beam exploit"));
+    assert!(place.0.text("page.svg").contains("\nbeam exploit"));
     agent(&place.board());
     assert_eq!(place.0.text("page.md"), text, "the same digits");
     let none = "--add | expected results of \"mine\", got none";

@@ -4,7 +4,7 @@
 //! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.svg`
 
 use emberwatch_agent::benchmark::report::save;
-use emberwatch_figures::{Curve, Lines, Panel, Scale};
+use emberwatch_agent::charts::{Curve, Lines, Panel, Point, Scale};
 use emberwatch_learning::config::{AgentConfig, StepSize};
 use std::path::Path;
 
@@ -26,17 +26,18 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         axis: "iteration n".into(),
         panels: panels.map(|(title, config)| panel(title, &config)).into(),
     };
-    Ok(save(
-        Path::new(&path),
-        &page.svg().ok_or("expected curves")?,
-    )?)
+    Ok(save(Path::new(&path), &page.svg()?)?)
 }
 
 fn panel(title: &str, config: &AgentConfig) -> Panel {
     let (model, dqn) = (config.autoencoder.step_size, config.dqn.step_size);
     let curve = |name: &str, value: &dyn Fn(u64) -> f64| {
         let points = (0..=ITERATIONS).step_by(100);
-        Curve::new(name, points.map(|n| (n as f64, value(n))).collect())
+        let points = points.map(|n| Point::new(n as f64, value(n)));
+        Curve {
+            name: name.into(),
+            points: points.collect(),
+        }
     };
     let at = |size: StepSize| move |n| size.at(n);
     Panel {

@@ -6,6 +6,7 @@
 //! - [`benchmark`] -- runs and scores policies on the same worlds
 //! - [`acting`] -- acts on one world of a running server
 //! - `training` -- trains learners while they act, with metrics and events
+//! - [`charts`] -- charts as SVG
 //! - [`client`] -- communication with the server
 //! - `flags` -- flags for the agent's settings
 //! - [`process`] -- the allocator and candle's thread counts
@@ -16,6 +17,7 @@
 
 pub mod acting;
 pub mod benchmark;
+pub mod charts;
 pub mod cli;
 pub mod client;
 mod commands;

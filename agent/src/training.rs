@@ -6,6 +6,7 @@
 
 mod acting;
 mod events;
+mod heat;
 pub mod metrics;
 pub mod seconds;
 mod spec;

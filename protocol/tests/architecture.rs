@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources. Each folder in them that contains source files is a layer.
-const SOURCES: [&str; 16] = [
+const SOURCES: [&str; 15] = [
     "protocol/src",
     "protocol/messages/src",
     "protocol/model/src",
@@ -16,7 +16,6 @@ const SOURCES: [&str; 16] = [
     "env-server/sim/src",
     "agent/src",
     "agent/belief/src",
-    "agent/figures/src",
     "agent/gradient/src",
     "agent/learning/src",
     "agent/network/src",

@@ -8,6 +8,7 @@ pub mod common_worlds;
 pub(crate) mod events;
 pub mod figures;
 pub mod leaderboard;
+pub mod leaderboard_chart;
 mod merit;
 mod number;
 mod policy_run;

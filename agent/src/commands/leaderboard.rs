@@ -2,8 +2,9 @@
 
 use super::shared::write;
 use crate::benchmark::report::leaderboard::{
-    About, Entry, check_entries, draw_leaderboard, file_stem, read_entries, render_page,
+    About, Entry, check_entries, file_stem, read_entries, render_page,
 };
+use crate::benchmark::report::leaderboard_chart::draw_leaderboard;
 use crate::benchmark::report::runs_file::read_runs;
 use crate::benchmark::report::suite::TaskRuns;
 use anyhow::{Context, Result, ensure};

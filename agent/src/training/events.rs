@@ -1,10 +1,10 @@
 //! TensorBoard events of a training: the columns of `metrics.csv`, and an image of the belief at intervals.
 
+use crate::training::heat::{Heat, heat};
 use crate::training::metrics::{Tick, averages};
 use crate::training::tensorboard::{EventFile, Value};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_figures::{Heat, heat};
 use emberwatch_learning::learners::{Learner, ModelUpdate};
 use std::path::Path;
 
@@ -50,7 +50,7 @@ impl Events {
     }
 
     fn show(&mut self, step: u64, belief: &Belief, state: usize) -> Result<()> {
-        let picture = heat(belief.probability(state).view());
+        let picture = heat(&belief.probability(state).to_owned());
         let Heat { height, width, png } = picture.expect("invariant: a grid has cells, and fits");
         let png = &png;
         let image = Value::Image { height, width, png };

@@ -119,7 +119,7 @@ def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
     done = compare(*flags, f"--figures={figures}", f"--csv={tmp_path / 'all.csv'}", *private())
     assert done.returncode == 0, done.stderr
     assert "| mine " in done.stdout and "| other " in done.stdout
-    assert ">mine<" in (figures / "ladder.svg").read_text()
+    assert "\nmine" in (figures / "ladder.svg").read_text()
     names = {row.policy for row in read(tmp_path / "all.csv")}
     assert names == {"random_walk", "coverage", "mine", "other"}
 

@@ -2,7 +2,7 @@
 //! other agents, and snapshots are written. Writes the server's resource usage, second by second, as a CSV file and as
 //! a figure.
 
-use emberwatch_figures::{Curve, Lines, Panel, Scale};
+use emberwatch_agent::charts::{Curve, Lines, Panel, Point, Scale};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -128,12 +128,13 @@ fn write(folder: &Path, rows: &[(f64, Use)]) {
     let panel = |title: &str, value: fn(&Use) -> f64| Panel {
         title: title.into(),
         scale: Scale::Linear,
-        curves: vec![Curve::new(
-            title.split(',').next().unwrap_or_default(),
-            rows.iter()
-                .map(|(seconds, used)| (*seconds, value(used)))
+        curves: vec![Curve {
+            name: title.split(',').next().unwrap_or_default().into(),
+            points: rows
+                .iter()
+                .map(|(seconds, used)| Point::new(*seconds, value(used)))
                 .collect(),
-        )],
+        }],
         shade: None,
     };
     let page = Lines {

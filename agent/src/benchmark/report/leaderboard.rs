@@ -2,13 +2,10 @@
 
 use crate::benchmark::report::columns::markdown;
 use crate::benchmark::report::common_worlds::CommonWorlds;
-use crate::benchmark::report::figures::{Height, draw_bars};
 use crate::benchmark::report::number::{NOTHING, number};
-use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
-use crate::benchmark::report::statistics::Estimate;
+use crate::benchmark::report::policy_run::PolicyRun;
 use crate::benchmark::report::suite::{
-    Aggregate, CEILING, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite,
-    score_text,
+    CEILING, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite, score_text,
 };
 use anyhow::{Context, Result, ensure};
 use emberwatch_learning::file::{Readers, replace_file};
@@ -366,55 +363,8 @@ fn n_tasks(n: usize, tasks: &[TaskRuns]) -> String {
     format!("{n} of {}", tasks.len())
 }
 
-/// Draws each entry's score over tasks, with a mark for its mean in each task. Entries that lack a task get only marks.
-pub fn draw_leaderboard(path: &Path, entries: &[Entry]) -> Result<()> {
-    let tasks = merged(entries);
-    let runs = entries.iter().flat_map(|entry| {
-        let policy = &entry.about.policy;
-        let any = entry.tasks.iter().flat_map(|task| &task.runs).next();
-        let score = |(index, task): (usize, &TaskRuns)| {
-            let mean = Estimate::of(&task.scores(policy))?.mean;
-            Some(PolicyRun {
-                world_seed: index as u64,
-                mean_reward: mean,
-                robots: 1,
-                team: ALONE.into(),
-                ..any?.clone()
-            })
-        };
-        tasks
-            .iter()
-            .enumerate()
-            .filter_map(score)
-            .collect::<Vec<_>>()
-    });
-    let runs: Vec<PolicyRun> = runs.collect();
-    if runs.is_empty() {
-        return Ok(()); // Without both ends of the scale there are no scores.
-    }
-    let scores: BTreeMap<&str, Option<Aggregate>> = by_score(&tasks).into_iter().collect();
-    let height = |group: &Group<'_>| match scores.get(group.policy).copied().flatten() {
-        Some(score) => Height {
-            value: score.mean,
-            ends: score.interval,
-            label: score_text(score),
-        },
-        None => Height {
-            value: f64::NAN,
-            ends: None,
-            label: format!("{} tasks", n_tasks(group.runs.len(), &tasks)),
-        },
-    };
-    let words = [
-        "Score of each policy over tasks",
-        "bars are interquartile means over tasks and worlds, whiskers 95 % intervals, dots means of single tasks",
-        "score: 0 is a random walk's, 1 an oracle's",
-    ];
-    draw_bars(path, &runs, words, &height)
-}
-
 /// Merges the tasks of all entries, in order of first appearance, each with the runs of all entries.
-fn merged(entries: &[Entry]) -> Vec<TaskRuns> {
+pub(super) fn merged(entries: &[Entry]) -> Vec<TaskRuns> {
     let mut tasks: Vec<TaskRuns> = Vec::new();
     for own in entries.iter().flat_map(|entry| &entry.tasks) {
         match tasks.iter_mut().find(|task| task.task == own.task) {

@@ -4,7 +4,7 @@
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use emberwatch_figures::{Curve, Lines, MAX_CURVES, Panel, Scale, Shade};
+use crate::charts::{Curve, Lines, MAX_CURVES, Panel, Scale, Shade};
 use std::collections::BTreeSet;
 
 /// Maximum number of points of a curve. More points would hardly be visible, and would enlarge the file.
@@ -91,17 +91,13 @@ fn curve(group: &Group<'_>, name: String, window: usize) -> Curve {
     let worlds: Vec<_> = worlds
         .map(|rewards| moving_average(rewards, window))
         .collect();
-    let estimate = |at: usize| {
+    let point = |at: usize| {
         let values: Vec<f64> = worlds.iter().map(|averages| averages[at].1).collect();
-        Estimate::of(&values).map(|estimate| (worlds[0][at].0, estimate))
+        Some(Estimate::of(&values)?.at(worlds[0][at].0))
     };
     let n_points = worlds.first().map_or(0, Vec::len);
-    let points: Vec<(f64, Estimate)> = (0..n_points).filter_map(estimate).collect();
-    Curve {
-        name,
-        points: points.iter().map(|it| (it.0, it.1.mean)).collect(),
-        errors: points.iter().filter_map(|it| it.1.standard_error).collect(),
-    }
+    let points = (0..n_points).filter_map(point).collect();
+    Curve { name, points }
 }
 
 /// Returns the length of the moving average: a round number of steps, about a fortieth of all.

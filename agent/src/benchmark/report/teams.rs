@@ -2,8 +2,7 @@
 
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
-use crate::benchmark::report::statistics::Estimate;
-use emberwatch_figures::{Curve, Lines, Panel, Scale};
+use crate::charts::{Curve, Lines, Panel, Point, Scale};
 use std::collections::BTreeSet;
 
 /// Returns the page: one curve per policy and kind of team, in the given order.
@@ -44,16 +43,14 @@ fn curve((policy, team): (&str, &str), kinds: &[(&str, &str)], groups: &[Group<'
     let own = groups
         .iter()
         .filter(|it| (it.policy, it.team) == (policy, team));
-    let mut points: Vec<(f64, Estimate)> = own
-        .filter_map(|group| {
-            let reward = group.estimate(|run| Some(run.mean_reward))?;
-            Some((f64::from(group.robots), reward))
-        })
-        .collect();
-    points.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let point = |group: &Group<'_>| {
+        let reward = group.estimate(|run| Some(run.mean_reward))?;
+        Some(reward.at(f64::from(group.robots)))
+    };
+    let mut points: Vec<Point> = own.filter_map(point).collect();
+    points.sort_by(|a, b| a.x.total_cmp(&b.x));
     Curve {
         name: readable(&name),
-        points: points.iter().map(|it| (it.0, it.1.mean)).collect(),
-        errors: points.iter().filter_map(|it| it.1.standard_error).collect(),
+        points,
     }
 }

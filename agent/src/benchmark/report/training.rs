@@ -2,9 +2,9 @@
 
 use crate::benchmark::report::figures::save;
 use crate::benchmark::report::statistics::Estimate;
+use crate::charts::{Curve, Lines, Panel, Point, Scale};
 use crate::training::metrics::Rows;
-use anyhow::{Context, Result};
-use emberwatch_figures::{Curve, Lines, Panel, Scale};
+use anyhow::Result;
 use std::path::Path;
 
 /// The figure's name in the folder of a training.
@@ -21,15 +21,13 @@ pub fn draw_training(folder: &Path) -> Result<()> {
         note: match per_point {
             1 => "each row of metrics.csv".into(),
             n => format!(
-                "means over {n} rows of metrics.csv each; bands: ±1 standard error over those rows, as if \
-                 rows were independent"
+                "means over {n} rows of metrics.csv each; bands: ±1 standard error, as if rows were independent"
             ),
         },
         axis: "world steps, of all worlds together".into(),
         panels: panels(&rows),
     };
-    let svg = page.svg().context("curves: expected metrics, got none")?;
-    save(&folder.join(FIGURE), &svg)
+    save(&folder.join(FIGURE), &page.svg()?)
 }
 
 fn panels(rows: &Rows) -> Vec<Panel> {
@@ -78,24 +76,23 @@ fn averages(rows: &Rows, column: &str, name: &str) -> Curve {
     let average = |(steps, values): (&[Option<f64>], &[Option<f64>])| {
         let there: Vec<f64> = values.iter().flatten().copied().collect();
         let last = steps.iter().flatten().last()?;
-        Some((*last, Estimate::of(&there)?))
+        Some(Estimate::of(&there)?.at(*last))
     };
-    let averages: Vec<(f64, Estimate)> = parts.filter_map(average).collect();
-    let error = |(_, average): &(f64, Estimate)| average.standard_error.unwrap_or(0.0);
-    let errors = averages.iter().map(error).collect();
     Curve {
         name: name.into(),
-        points: averages.iter().map(|it| (it.0, it.1.mean)).collect(),
-        errors: if part > 1 { errors } else { Vec::new() },
+        points: parts.filter_map(average).collect(),
     }
 }
 
 /// Returns the model's step size divided by the DQN's, where both exist (paper eq. 20).
 fn quotient([model, dqn]: &[Curve; 2]) -> Curve {
-    let of_dqn = |x: f64| dqn.points.iter().find(|point| point.0 == x);
-    let share = |&(x, rate): &(f64, f64)| Some((x, rate / of_dqn(x)?.1));
-    Curve::new(
-        "model / DQN",
-        model.points.iter().filter_map(share).collect(),
-    )
+    let of_dqn = |x: f64| dqn.points.iter().find(|point| point.x == x);
+    let share = |point: &Point| {
+        let quotient = point.y / of_dqn(point.x)?.y;
+        Some(Point::new(point.x, quotient))
+    };
+    Curve {
+        name: "model / DQN".into(),
+        points: model.points.iter().filter_map(share).collect(),
+    }
 }
