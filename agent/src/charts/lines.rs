@@ -1,11 +1,10 @@
 //! Panels of curves over a common axis, with error bands, and names at the ends of the curves.
 
 use super::page::{
-    Area, GRID, HEAD, INK, LABEL, MARGIN, MUTED, NOTE, WIDTH, begin, covering, darker, finish, fit,
-    is_drawable, style, tick, width,
+    Area, GRID, HEAD, INK, LABEL, MARGIN, MAX_VALUE, MUTED, NOTE, WIDTH, begin, covering, darker,
+    finish, fit, is_drawable, style, tick, width,
 };
 use anyhow::{Result, ensure};
-use plotters::coord::combinators::BindKeyPoints;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
 use plotters::style::text_anchor::HPos;
@@ -32,10 +31,10 @@ const SHADE: RGBColor = RGBColor(0xf7, 0xe6, 0xd8);
 /// Heights of a panel with its title: if there are several panels, and if there is only one.
 const PANEL: i32 = 326;
 const ONLY_PANEL: i32 = 900;
-/// Heights of a panel's title, of the gap below its plot, and of the axis below the last plot.
+/// Heights of a panel's title, of the ticks below its plot, and of the axis label below the last panel.
 const TITLE: i32 = 52;
-const GAP: i32 = 34;
-const FOOT: i32 = 84;
+const TICKS: i32 = 44;
+const FOOT: i32 = 82;
 /// Length of the line from a curve's end to its name, and minimum distance between names.
 const LEADER: i32 = 46;
 const NAME_GAP: i32 = 34;
@@ -113,7 +112,8 @@ impl Lines {
             "{}: expected points, got none",
             self.title
         );
-        let height = HEAD + panel_height(panels.len()) * panels.len() as i32 + FOOT;
+        let of_panel = if panels.len() == 1 { ONLY_PANEL } else { PANEL };
+        let height = HEAD + of_panel * panels.len() as i32 + FOOT;
         let mut svg = String::new();
         self.draw(&panels, &begin(&mut svg, height, &self.title, &self.note)?)?;
         Ok(finish(&svg, height))
@@ -124,62 +124,61 @@ impl Lines {
         let last = curves().flat_map(|curve| &curve.points);
         let last = last.map(|point| point.x.ceil()).fold(1.0, f64::max);
         let names = curves().map(|curve| width(&curve.name, LABEL)).max();
-        let height = panel_height(panels.len());
-        for (index, panel) in panels.iter().enumerate() {
-            let is_last = index + 1 == panels.len();
-            let frame = Frame {
-                top: HEAD + height * index as i32,
-                height: height + if is_last { FOOT } else { 0 },
-                right: MARGIN + LEADER + names.unwrap_or(0),
-                last,
-                n_ticks: if panels.len() == 1 { 9 } else { 5 },
-                axis: is_last.then_some(&self.axis),
-            };
+        let mut frame = Frame {
+            right: WIDTH - MARGIN - names.unwrap_or(0) - LEADER,
+            last,
+            n_ticks: [0, if panels.len() == 1 { 9 } else { 5 }],
+        };
+        let areas = page.clone().margin(HEAD, FOOT, 0, 0);
+        let areas = areas.split_evenly((panels.len(), 1));
+        for (index, (panel, area)) in panels.iter().zip(areas).enumerate() {
+            if index + 1 == panels.len() {
+                frame.n_ticks[0] = (last as usize + 1).min(9);
+            }
             let values = || panel.values();
             match panel.scale {
-                Scale::Linear => panel.draw(page, &frame, covering(values()))?,
+                Scale::Linear => panel.draw(&area, &frame, covering(values()))?,
                 Scale::Logarithmic => {
-                    let least = values().fold(f64::MAX, f64::min).log10().floor() as i32;
-                    let most = values().fold(0.0, f64::max).log10().ceil() as i32;
-                    let most = most.max(least + 1);
-                    let step = ((most - least) as usize).div_ceil(frame.n_ticks);
-                    let powers = (least..=most).step_by(step);
-                    let powers = powers.map(|power| 10_f64.powi(power)).collect();
-                    let range = (10_f64.powi(least)..10_f64.powi(most)).log_scale();
-                    panel.draw(page, &frame, range.with_key_points(powers))?;
+                    let least = values().fold(f64::MAX, f64::min).log10().floor();
+                    let most = values().fold(0.0, f64::max).log10().ceil();
+                    let most = most.max(least + 1.0);
+                    // Slightly more than the powers of ten, because plotters rounds their ticks.
+                    let range = 0.999 * 10_f64.powf(least)..1.001 * 10_f64.powf(most);
+                    panel.draw(&area, &frame, range.log_scale())?;
                 }
             }
         }
-        Ok(())
+        let left = MARGIN + MAX_TICK;
+        let axis = fit(&self.axis, LABEL, frame.right - left);
+        let at = ((left + frame.right) / 2, page.dim_in_pixel().1 as i32 - 46);
+        Ok(page.draw_text(&axis, &style(LABEL, INK, HPos::Center), at)?)
     }
 }
 
-fn panel_height(n_panels: usize) -> i32 {
-    if n_panels == 1 { ONLY_PANEL } else { PANEL }
-}
-
-/// The position of a panel, and the axis that all panels share.
-struct Frame<'a> {
-    top: i32,
-    height: i32,
-    /// Width of the margin with the names of curves.
+/// What all panels share.
+struct Frame {
+    /// The right edge of the plots.
     right: i32,
     /// The last value of the horizontal axis.
     last: f64,
-    /// Maximum number of ticks of the vertical axis.
-    n_ticks: usize,
-    /// The label of the horizontal axis, if it is drawn.
-    axis: Option<&'a String>,
+    /// Maximum numbers of ticks of the horizontal and of the vertical axis.
+    n_ticks: [usize; 2],
 }
 
 impl Panel {
-    /// Returns the panel with only what can be drawn.
+    /// Returns the panel with only what can be drawn. Points whose error band cannot be drawn get none.
     fn drawable(&self) -> Self {
-        let fits = |y: f64| is_drawable(y) && (self.scale == Scale::Linear || y > 0.0);
+        let is_linear = self.scale == Scale::Linear;
+        let fits = |y: f64| is_drawable(y) && (is_linear || y >= 1.0 / MAX_VALUE);
         let drawable = |point: &&Point| (0.0..1e15).contains(&point.x) && fits(point.y);
+        let point = |&Point { x, y, error }: &Point| {
+            let has_band = fits(y - error) && fits(y + error);
+            let error = if has_band { error } else { 0.0 };
+            Point { x, y, error }
+        };
         let curve = |curve: &Curve| Curve {
             name: fit(&curve.name, LABEL, MAX_NAME),
-            points: curve.points.iter().filter(drawable).copied().collect(),
+            points: curve.points.iter().filter(drawable).map(point).collect(),
         };
         let curves = self.curves.iter().take(MAX_CURVES).map(curve);
         Self {
@@ -188,44 +187,26 @@ impl Panel {
         }
     }
 
-    /// Returns the edges of a curve's error band, the lower edge first. Omits points where an edge cannot be drawn.
-    fn band(&self, curve: &Curve) -> Vec<(f64, [f64; 2])> {
-        let edges = |point: &Point| (point.x, [point.y - point.error, point.y + point.error]);
-        let fits = |edge: &f64| is_drawable(*edge) && (self.scale == Scale::Linear || *edge > 0.0);
-        let band = curve.points.iter().filter(|point| point.error > 0.0);
-        band.map(edges)
-            .filter(|(_, edges)| edges.iter().all(fits))
-            .collect()
-    }
-
     fn values(&self) -> impl Iterator<Item = f64> + '_ {
-        self.curves.iter().flat_map(|curve| {
-            let edges = self.band(curve).into_iter().flat_map(|it| it.1);
-            curve.points.iter().map(|point| point.y).chain(edges)
-        })
+        let points = self.curves.iter().flat_map(|curve| &curve.points);
+        points.flat_map(|point| [point.y - point.error, point.y + point.error])
     }
 
-    fn draw<Y>(&self, page: &Area<'_>, frame: &Frame<'_>, values: Y) -> Result<()>
+    fn draw<Y>(&self, area: &Area<'_>, frame: &Frame, values: Y) -> Result<()>
     where
         Y: AsRangedCoord<Value = f64>,
         Y::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
     {
-        let area = page.clone().shrink((0, frame.top), (WIDTH, frame.height));
         let shade = self.shade.iter().flat_map(|shade| &shade.points);
         let shade = shade.filter(|point| point.0 <= frame.last && is_drawable(point.1));
         let shade: Vec<(f64, f64)> = shade.map(|&(x, y)| (x, y.max(0.0))).collect();
         let most = shade.iter().map(|point| point.1);
         let most = most.fold(f64::MIN_POSITIVE, f64::max);
-        let mut chart = ChartBuilder::on(&area)
+        let mut chart = ChartBuilder::on(area)
             .margin_top(TITLE)
             .margin_left(MARGIN)
-            .margin_right(frame.right)
-            .margin_bottom(if frame.axis.is_some() { 16 } else { GAP })
-            .x_label_area_size(if frame.axis.is_some() {
-                FOOT + GAP - 16
-            } else {
-                0
-            })
+            .margin_right(WIDTH - frame.right)
+            .x_label_area_size(TICKS)
             .y_label_area_size(MAX_TICK)
             .build_cartesian_2d(0.0..frame.last, values)?
             // The highest part of the shaded area reaches 40 % of the plot's height.
@@ -238,30 +219,24 @@ impl Panel {
             .set_all_tick_mark_size(10)
             .bold_line_style(GRID.stroke_width(2))
             .light_line_style(TRANSPARENT)
-            .x_labels((frame.last as usize + 1).min(9))
+            .x_labels(frame.n_ticks[0])
             .x_label_formatter(&tick)
             .x_label_style(style(NOTE, MUTED, HPos::Center))
-            .y_labels(frame.n_ticks)
+            .y_labels(frame.n_ticks[1])
             .y_label_formatter(&tick)
             .y_label_style(style(NOTE, MUTED, HPos::Right))
-            .x_desc(
-                frame
-                    .axis
-                    .map_or(String::new(), |axis| fit(axis, LABEL, 1000)),
-            )
-            .axis_desc_style(style(LABEL, INK, HPos::Center))
             .draw()?;
         if self.scale == Scale::Linear {
             let zero = vec![(0.0, 0.0), (frame.last, 0.0)];
             chart.draw_series([PathElement::new(zero, INK.stroke_width(2))])?;
         }
         for (curve, color) in self.curves.iter().zip(COLORS) {
-            let band = self.band(curve);
-            let lower = band.iter().map(|&(x, edges)| (x, edges[0]));
-            let upper = band.iter().rev().map(|&(x, edges)| (x, edges[1]));
-            let area: Vec<(f64, f64)> = lower.chain(upper).collect();
-            if area.len() > 2 {
-                chart.draw_series([Polygon::new(area, color.mix(0.18))])?;
+            let band = curve.points.iter().filter(|point| point.error > 0.0);
+            let lower = band.clone().map(|point| (point.x, point.y - point.error));
+            let upper = band.rev().map(|point| (point.x, point.y + point.error));
+            let band: Vec<(f64, f64)> = lower.chain(upper).collect();
+            if !band.is_empty() {
+                chart.draw_series([Polygon::new(band, color.mix(0.18))])?;
             }
         }
         let mut ends = Vec::new();
@@ -275,41 +250,42 @@ impl Panel {
             }
             chart.draw_series(LineSeries::new(points, color.stroke_width(3)))?;
         }
-        self.draw_names(page, frame, &ends)?;
-        self.draw_title(page, frame)
+        self.draw_names(area, frame.right, &ends)?;
+        self.draw_title(area)
     }
 
-    /// Writes each curve's name next to its end, with a connecting line.
-    fn draw_names(&self, page: &Area<'_>, frame: &Frame<'_>, ends: &[(i32, i32)]) -> Result<()> {
-        let top = frame.top + TITLE;
-        let bottom = frame.top + frame.height - GAP - if frame.axis.is_some() { FOOT } else { 0 };
-        let heights: Vec<i32> = ends.iter().map(|end| end.1).collect();
-        let heights = spread(&heights, top, bottom);
-        let right = WIDTH - frame.right;
-        for (((curve, color), &end), height) in
-            self.curves.iter().zip(COLORS).zip(ends).zip(heights)
-        {
-            let line = vec![end, (right + 8, end.1), (right + LEADER - 10, height)];
-            page.draw(&PathElement::new(line, color.stroke_width(2)))?;
-            let at = (right + LEADER, height);
-            page.draw_text(&curve.name, &style(LABEL, darker(color), HPos::Left), at)?;
+    /// Writes each curve's name next to its end on the page, with a connecting line.
+    fn draw_names(&self, area: &Area<'_>, right: i32, ends: &[(i32, i32)]) -> Result<()> {
+        let top = area.get_base_pixel().1;
+        let heights: Vec<i32> = ends.iter().map(|end| end.1 - top).collect();
+        let bottom = area.dim_in_pixel().1 as i32 - TICKS;
+        let names = spread(&heights, TITLE, bottom);
+        for (index, curve) in self.curves.iter().enumerate() {
+            let (color, height, name) = (COLORS[index], heights[index], names[index]);
+            let line = [
+                (ends[index].0, height),
+                (right + 8, height),
+                (right + LEADER - 10, name),
+            ];
+            area.draw(&PathElement::new(line, color.stroke_width(2)))?;
+            let style = style(LABEL, darker(color), HPos::Left);
+            area.draw_text(&curve.name, &style, (right + LEADER, name))?;
         }
         Ok(())
     }
 
-    fn draw_title(&self, page: &Area<'_>, frame: &Frame<'_>) -> Result<()> {
-        let middle = frame.top + 18;
-        let note = self.shade.as_ref().map_or("", |shade| &shade.name);
-        let note = fit(note, NOTE, WIDTH / 2);
-        let left = WIDTH - MARGIN - width(&note, NOTE);
-        let title = fit(&self.title, LABEL, left - 2 * MARGIN);
-        page.draw_text(&title, &style(LABEL, INK, HPos::Left), (MARGIN, middle))?;
-        if self.shade.is_some() {
-            let square = [(left - 38, middle - 13), (left - 12, middle + 13)];
-            page.draw(&Rectangle::new(square, SHADE.filled()))?;
-            page.draw_text(&note, &style(NOTE, MUTED, HPos::Left), (left, middle))?;
+    /// Writes the title, and at the right what is shaded.
+    fn draw_title(&self, area: &Area<'_>) -> Result<()> {
+        let mut right = WIDTH - MARGIN;
+        if let Some(shade) = &self.shade {
+            let name = fit(&shade.name, NOTE, WIDTH / 2);
+            right -= width(&name, NOTE);
+            area.draw_text(&name, &style(NOTE, MUTED, HPos::Left), (right, 18))?;
+            let square = [(right - 38, 5), (right - 12, 31)];
+            area.draw(&Rectangle::new(square, SHADE.filled()))?;
         }
-        Ok(())
+        let title = fit(&self.title, LABEL, right - 2 * MARGIN);
+        Ok(area.draw_text(&title, &style(LABEL, INK, HPos::Left), (MARGIN, 18))?)
     }
 }
 

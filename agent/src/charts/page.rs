@@ -30,7 +30,7 @@ const LETTER: f64 = 0.55;
 
 /// Minimum range of an axis, and maximum absolute value on it. Beyond these limits, plotters finds no ticks.
 const MIN_RANGE: f64 = 1e-15;
-const MAX_VALUE: f64 = 1e200;
+pub const MAX_VALUE: f64 = 1e100;
 
 /// Begins a page with a title and a line of small print.
 pub fn begin<'a>(svg: &'a mut String, height: i32, title: &str, note: &str) -> Result<Area<'a>> {

@@ -97,6 +97,8 @@ fn unusual_values_and_names_are_drawn_or_omitted() {
         f64::MAX,
         f64::MIN_POSITIVE,
         -1e150,
+        -1e99,
+        2e-99,
         1e6,
         0.0,
     ] {
