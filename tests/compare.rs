@@ -1,14 +1,13 @@
 //! End-to-end tests of `emberwatch-agent compare`: repeated comparisons are equal bit for bit, also with a second
 //! model.
 
-use crate::commands::{TINY, agent, check};
+use crate::commands::agent;
+use emberwatch_agent::benchmark::report::PolicyRun;
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
-use emberwatch_agent::benchmark::report::{PolicyRun, RunsFile};
 use emberwatch_protocol::{Dynamics, Model, Shape};
 use emberwatch_sim::world::{Source, World};
 use std::sync::atomic::AtomicBool;
-use std::time::Duration;
-use tests::harness::{AGENT, Folder, Program, Server, repository};
+use tests::harness::{Folder, Program, Server, repository};
 
 /// The flags of a comparison, except those for its worlds.
 const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-width 4";
@@ -55,16 +54,6 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
         let text = folder.text(&format!("figures/{name}"));
         assert!(text.contains(words), "{name}: {text}");
     }
-    let csv = folder.path("out.csv");
-    let held = RunsFile::lock(&csv, Duration::ZERO).expect("locked");
-    let compare = format!("compare {TINY} --csv {}", csv.display());
-    check(
-        AGENT,
-        &compare,
-        "--csv: write | out.csv: another process is writing it",
-    );
-    drop(held);
-    agent(&compare);
 }
 
 #[test]

@@ -1,10 +1,12 @@
-//! Tests of `emberwatch-agent suite` and `leaderboard`: resumed results, the score, and the page of entries.
+//! Tests of `emberwatch-agent suite` and `leaderboard`: kept results, the score, and the page of entries.
 
 use crate::commands::{agent, check, check_table};
 use emberwatch_agent::benchmark::report::PolicyRun;
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
+use rustix::process::Signal;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use tests::harness::{AGENT, Ended, Folder, LIMIT, Program, program_path};
+use tests::harness::{AGENT, Ended, Folder, LIMIT, Program, SERVER, program_path};
 
 const TASK: &str = "name = \"tiny\"
 model = \"wildfire-small\"
@@ -35,8 +37,19 @@ impl Place {
         agent(&format!("suite --tasks {task} --out {out} {flags}"))
     }
 
-    fn rows(&self) -> Vec<PolicyRun> {
-        read_runs(&self.0.path("out/tiny.csv")).expect("rows")
+    fn rows(&self, policy: &str) -> Vec<PolicyRun> {
+        let file = format!("out/tiny/{policy}.csv");
+        read_runs(&self.0.path(&file)).expect("rows")
+    }
+
+    /// Writes the rows of `coverage` in the form in which the Python package writes them, for a policy `python`.
+    fn write_python(&self) -> String {
+        let rows = self.0.text("out/tiny/coverage.csv");
+        let fingerprint = &self.rows("coverage")[0].policy_fingerprint;
+        let text = rows
+            .replace(fingerprint, "")
+            .replace("coverage,", "python,");
+        self.0.write("out/tiny/python.csv", text)
     }
 
     fn board(&self) -> String {
@@ -50,29 +63,39 @@ impl Place {
     }
 }
 
-fn rewards(rows: &[PolicyRun], policy: &str) -> Vec<f64> {
-    let rows = rows.iter().filter(|run| run.policy == policy);
-    rows.map(|run| run.mean_reward).collect()
+fn rewards(rows: &[PolicyRun]) -> Vec<f64> {
+    rows.iter().map(|run| run.mean_reward).collect()
 }
 
 #[test]
-fn a_suite_goes_on_and_its_results_make_a_page() {
+fn a_suite_keeps_equal_rows_and_its_results_make_a_page() {
     let place = Place::new();
     let first = place.suite("--policies coverage");
     first.check_prints("| oracle_ahead | 1.000 |");
-    let csv = || place.0.text("out/tiny.csv");
-    let rows = csv();
-    assert_eq!(rows.lines().count(), 1 + 3 * 3, "{rows}");
-    // The policies of existing rows are not run again, so the planning times in these rows are unchanged.
+    let rows = place.rows("coverage");
+    assert_eq!(rows.len(), 3);
+    // Kept rows are not run again, so their planning times are unchanged.
     let more = place.suite("--policies coverage,beam_exploit,learned_beam");
     more.check_prints("| beam_exploit |");
     more.check_says("3 rows of coverage kept");
-    assert_eq!(csv().lines().count(), 1 + 4 * 3, "learned_beam is left out");
-    assert!(rows.lines().all(|row| csv().contains(row)));
-    let all = place.rows();
+    more.check_says("learned_beam is not run: it needs a checkpoint");
+    assert_eq!(place.rows("coverage"), rows);
+    place
+        .suite("--worlds 2")
+        .check_says("2 rows of coverage kept");
+    assert_eq!(place.rows("coverage"), rows);
+    let wide = rewards(&place.rows("beam_exploit"));
     place.suite("--policies coverage,beam_exploit --beam-width 2");
-    let narrow = rewards(&place.rows(), "beam_exploit");
-    assert_ne!(narrow, rewards(&all, "beam_exploit"));
+    assert_ne!(rewards(&place.rows("beam_exploit")), wide);
+    // A program with one more byte stands for a program built from changed files.
+    let mut program = std::fs::read(program_path(SERVER)).expect("a program");
+    program.push(0);
+    let other = place.0.write("server", program);
+    let executable = PermissionsExt::from_mode(0o700);
+    std::fs::set_permissions(&other, executable).expect("executable");
+    let built = place.suite(&format!("--policies coverage --server {other}"));
+    built.check_says("coverage is run: its rows are from another build, checkpoint or settings");
+    assert_ne!(place.rows("coverage"), rows);
 
     let early = place.entry("coverage");
     check(AGENT, &early, "expected an entry of random_walk");
@@ -129,16 +152,7 @@ fn a_suite_goes_on_and_its_results_make_a_page() {
 fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
     let place = Place::new();
     place.suite("--policies coverage");
-    // Builds rows for the same worlds in the form in which the Python package writes them.
-    let rows = place.0.text("out/tiny.csv");
-    let of_coverage = rows.lines().filter(|row| row.starts_with("coverage"));
-    let python: Vec<String> = of_coverage
-        .map(|row| row.replace("coverage", "python"))
-        .collect();
-    let header = rows.lines().next().expect("a header");
-    let text = python.join("\n");
-    let others = place.0.write("others.csv", format!("{header}\n{text}\n"));
-    place.0.write("out/tiny.csv", format!("{rows}{text}\n"));
+    let others = place.write_python();
     place.suite("--policies coverage").check_prints("| python ");
     let compare = format!(
         "compare --task {} --policies random_walk --baseline random_walk --add {others}",
@@ -148,42 +162,40 @@ fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
     for policy in ["random_walk", "oracle_ahead", "python"] {
         agent(&place.entry(policy));
     }
-    let page = place.0.text("page.md");
+    let (page, rows) = (place.0.text("page.md"), place.0.text("out/tiny/python.csv"));
     for (from, to, what) in [
-        ("burn_in = 300", "burn_in = 50", "worlds_fingerprint"),
+        (
+            "burn_in = 300",
+            "burn_in = 50",
+            "python\" on world 0: worlds_fingerprint",
+        ),
         (
             "max_steps = 40",
             "max_steps = 41",
-            "steps: expected 41, got 40",
+            "python\" on world 0: steps: expected 41, got 40",
         ),
     ] {
         place.0.write("tiny.toml", TASK.replacen(from, to, 1));
         let changed = place.suite("--policies coverage");
-        changed.check_says("3 rows of coverage are run again");
-        let of_python = format!("policy \"python\" on world 0: {what}");
-        changed.check_says(&format!("python is left out: {of_python}"));
+        changed.check_says("coverage is run: policy \"coverage\" on world 0: ");
+        changed.check_says(&format!("python is left out: policy \"{what}"));
         assert!(!changed.stdout.contains("python"), "{}", changed.stdout);
-        let rows = place.0.text("out/tiny.csv");
-        assert!(python.iter().all(|row| rows.contains(row)), "none are lost");
-        check(AGENT, &compare, &format!("--add: {of_python}"));
+        assert_eq!(place.0.text("out/tiny/python.csv"), rows, "none are lost");
+        check(AGENT, &compare, &format!("--add: policy \"{what}"));
         check(AGENT, &place.entry("coverage"), "entry coverage, task tiny");
         assert!(!place.0.path("entries/coverage.csv").exists());
         assert_eq!(place.0.text("page.md"), page);
     }
-}
-
-#[test]
-fn two_suites_that_fill_one_folder_at_once_lose_no_rows() {
-    let place = &Place::new();
-    std::thread::scope(|scope| {
-        for policy in ["coverage", "beam_exploit"] {
-            scope.spawn(move || place.suite(&format!("--policies {policy}")));
-        }
-    });
-    let rows = place.rows();
-    for policy in ["random_walk", "oracle_ahead", "coverage", "beam_exploit"] {
-        assert_eq!(rewards(&rows, policy).len(), 3, "{policy}");
-    }
+    place.0.write("out/tiny/python.csv", "policy\nmine\n");
+    check(
+        AGENT,
+        &format!(
+            "suite --tasks {} --out {}",
+            place.0.word("tiny.toml"),
+            place.0.word("out")
+        ),
+        "task tiny: | out/tiny/python.csv: expected a CSV file",
+    );
 }
 
 #[test]
@@ -193,57 +205,57 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     let recorded = "name = \"fires\"\nstates = \"jacksboro\"\nmoves = 8\nmax_steps = 10\n\
                     test_seeds = { start = 0, end = 2 }\n";
     folder.write("fires.toml", recorded);
-    let suite = |flags: &str| {
+    let words = |flags: &str| {
         let [tiny, fires, out, runs] =
             ["tiny.toml", "fires.toml", "out", "runs"].map(|name| folder.word(name));
         let policies = "learned_beam,learned_policy,neural_beam,beam_exploit,known/options/learned";
-        agent(&format!(
+        format!(
             "suite --tasks {tiny},{fires} --out {out} --policies {policies} --checkpoints {runs} {flags}"
-        ))
+        )
     };
+    let suite = |flags: &str| agent(&words(flags));
+    // A training that was killed leaves nothing that counts.
+    let flags = "--train --train-steps 100000000";
+    let killed = Program::start(AGENT, &words(flags));
+    killed.until(|| folder.path("runs/tiny/training").exists());
+    killed.wait_for_words("learning");
+    killed.signal(Signal::INT);
+    killed.wait(LIMIT);
+    assert!(!folder.path("runs/tiny/filter").exists());
     let first = suite("--train --train-steps 64");
-    first.check_says("task tiny: training filter for learned_beam, 0 of 64 world steps done");
-    first.check_says("task fires: training decisions for learned_policy, 0 of 64 world steps");
+    first.check_says("task tiny: training filter for learned_beam");
+    first.check_says("task fires: training decisions for learned_policy");
     for policy in ["beam_exploit", "known/options/learned"] {
         let gap = "is not run: it needs a known model, and recorded worlds have none";
         first.check_says(&format!("task fires: {policy} {gap}"));
     }
-    for task in ["out/tiny.csv", "out/fires.csv"] {
-        let runs = read_runs(&folder.path(task)).expect("rows");
+    for task in ["tiny", "fires"] {
         let seconds = |policy: &str| {
-            let run = runs.iter().find(|run| run.policy == policy);
-            run.expect(policy).training_seconds.expect("kept")
+            let runs = read_runs(&folder.path(&format!("out/{task}/{policy}.csv")));
+            runs.expect("rows")[0].training_seconds.expect(policy)
         };
         assert!(seconds("neural_beam") > 0.0);
         assert!(seconds("learned_policy") >= seconds("learned_beam"));
         assert_eq!(seconds("random_walk"), 0.0);
+        assert!(!folder.path(&format!("runs/{task}/training")).exists());
     }
-    let again = suite("--train --train-steps 64 --beam-width 3");
-    again.check_says("runs/tiny/filter is kept, although it was trained with other settings");
-    assert!(
-        !again.stderr.contains("training filter"),
-        "{}",
-        again.stderr
-    );
-    suite("").check_says(
-        "neural_beam acts on an unfinished training: 64 of 48000 world steps (--learner neural)",
-    );
-    let longer = suite("--train --train-steps 96");
-    for words in [
-        "task tiny: training neural for neural_beam, 64 of 96 world steps done",
-        "3 rows of neural_beam are run again",
-        "3 rows of random_walk kept",
-        "tiny/decisions-learned_filter was learned on",
-        "remove it to train the belief further",
-    ] {
-        longer.check_says(words);
-    }
+    // Complete trainings stay, whatever the flags.
+    let again = suite("--train --train-steps 96");
+    again.check_says("3 rows of learned_policy kept");
+    assert!(!again.stderr.contains(": training"), "{}", again.stderr);
     let checkpoint =
         |task: &str| folder.path(&format!("runs/{task}/filter/checkpoint.safetensors"));
     std::fs::copy(checkpoint("fires"), checkpoint("tiny")).expect("another belief");
     let mixed = suite("");
-    mixed.check_says("tiny/decisions-learned_filter was learned on another belief than");
-    mixed.check_says("rows of learned_beam are run again");
+    mixed.check_says("learned_policy is not run: checkpoint ");
+    mixed.check_says("got two: the belief of the decisions, and another");
+    mixed.check_says("learned_beam is run: its rows are from another build, checkpoint");
+    // Without a checkpoint, a training begins anew.
+    std::fs::remove_file(checkpoint("tiny")).expect("removed");
+    suite("").check_says("learned_beam is not run: checkpoint ");
+    let anew = suite("--train --train-steps 64");
+    anew.check_says("task tiny: training filter for learned_beam");
+    assert!(checkpoint("tiny").exists());
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::PolicyRun;
+use crate::benchmark::report::common_worlds::CommonWorlds;
 use crate::benchmark::team::Team;
 use crate::benchmark::world_run::WorldRun;
 use crate::client::view::view;
@@ -18,9 +19,9 @@ use emberwatch_learning::rollout::agent::Agent;
 use emberwatch_learning::rollout::{
     self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
 };
+use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::feed::Feed;
 use emberwatch_protocol::{Model, Move};
-use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -100,11 +101,9 @@ pub fn compare(
                 let share = 1.0 / seeds.len() as f32;
                 results.add_fire(share, &worlds);
             }
-            let model = arena.known_model();
-            let fingerprint = comparison.policy_fingerprint(&contestant.policy, model);
             let runs = worlds.into_iter();
             let Contestant { policy, team } = contestant;
-            let runs = runs.map(|world| world.into_run(policy, *team, arena.info(), &fingerprint));
+            let runs = runs.map(|world| world.into_run(policy, *team, arena.info()));
             results.runs.extend(runs);
         }
     }
@@ -122,18 +121,14 @@ impl Comparison {
         self.teams.iter().map(n_policies).sum()
     }
 
-    /// Returns 16 hexadecimal digits that identify all that a policy's actions depend on, except its name and worlds.
-    pub fn policy_fingerprint(&self, policy: &Policy, model: &Model) -> String {
-        let learned = policy.needs_checkpoint().then_some(&self.learned.digests);
-        let model = toml::to_string(model.file()).expect("invariant: model files serialise");
-        let config = toml::to_string(&self.config).expect("invariant: settings serialise");
-        let version = env!("CARGO_PKG_VERSION");
-        let mut text = format!("{version}\n{model}\n{config}\n{learned:?}");
-        if self.first_state_known {
-            text += "\nfirst state known";
+    /// Returns what the rows of this comparison have in common.
+    pub fn worlds(&self, info: &ServerInfo) -> CommonWorlds {
+        CommonWorlds {
+            fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
+            seeds: self.seeds.clone().collect(),
+            steps: self.steps,
+            recent_steps: Some(self.recent_steps),
         }
-        let hash = Sha256::digest(text);
-        hash[..8].iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
     /// Returns each policy with each kind of team, but the oracle team only once.

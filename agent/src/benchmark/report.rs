@@ -23,5 +23,4 @@ pub mod training;
 pub use self::events::write_events;
 pub use self::figures::{draw_ladder, draw_rewards, draw_teams, save};
 pub use self::policy_run::{ALONE, PolicyRun};
-pub use self::runs_file::RunsFile;
 pub use self::table::render_table;

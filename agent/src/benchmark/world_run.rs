@@ -83,13 +83,7 @@ impl WorldRun {
     }
 
     /// Summarises the run as a row of the results.
-    pub fn into_run(
-        self,
-        policy: &Policy,
-        team: Team,
-        info: &ServerInfo,
-        fingerprint: &str,
-    ) -> PolicyRun {
+    pub fn into_run(self, policy: &Policy, team: Team, info: &ServerInfo) -> PolicyRun {
         let (tally, merit) = (self.tally, self.merit.merit());
         let steps = tally.rewards.len() as u64;
         let brier = tally.brier;
@@ -120,7 +114,7 @@ impl WorldRun {
             grid_seen_share: Some(merit.grid_seen_share),
             log_likelihood: (tally.score.n_seen > 0).then(|| tally.score.mean()),
             worlds_fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
-            policy_fingerprint: fingerprint.into(),
+            policy_fingerprint: String::new(),
             training_seconds: None,
             is_added: false,
             rewards: tally.rewards,

@@ -4,9 +4,11 @@ use anyhow::{Context, Result, bail, ensure};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::connection::Connection;
 use emberwatch_protocol::limits::threads::spawn;
+use sha2::{Digest, Sha256};
 use std::collections::hash_map::RandomState;
+use std::fs::File;
 use std::hash::BuildHasher;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, copy};
 use std::net::SocketAddr;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
@@ -53,6 +55,18 @@ impl OwnServer {
 
     pub fn instance(&self) -> &Instance {
         &self.instance
+    }
+
+    /// Returns a digest of two running programs, this one and the server. A program that is built anew from changed
+    /// files has another digest, even if the files have been replaced since the start.
+    pub fn build(&self) -> Result<String> {
+        let mut hash = Sha256::new();
+        for pid in [std::process::id(), self.program.0.id()] {
+            let path = format!("/proc/{pid}/exe");
+            let program = File::open(&path).and_then(|mut file| copy(&mut file, &mut hash));
+            program.with_context(|| format!("read {path}"))?;
+        }
+        Ok(format!("{:x}", hash.finalize()))
     }
 
     fn wait_until_it_answers(&mut self) -> Result<()> {

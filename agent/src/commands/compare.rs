@@ -1,14 +1,14 @@
 //! `compare`: runs policies on the same worlds, and reports their results.
 
-use super::shared::{asks_for_help, lock_csv, make_folder, write};
+use super::shared::{asks_for_help, check_csv, make_folder, write};
 use super::worlds::WorldFlags;
 use crate::benchmark::arena::Arena;
 use crate::benchmark::compare::{Comparison, Results, compare};
-use crate::benchmark::report::common_worlds::{CommonWorlds, check_added, check_fire};
-use crate::benchmark::report::runs_file::read_runs;
+use crate::benchmark::report::common_worlds::check_added;
+use crate::benchmark::report::runs_file::{read_runs, write_runs};
 use crate::benchmark::report::{
-    PolicyRun, RunsFile, draw_ladder, draw_rewards, draw_teams, figures::FIRE_CELLS_PER_STEP,
-    render_table, write_events,
+    PolicyRun, draw_ladder, draw_rewards, draw_teams, figures::FIRE_CELLS_PER_STEP, render_table,
+    write_events,
 };
 use crate::benchmark::team::Team;
 use crate::client::launch::OwnDashboard;
@@ -96,7 +96,7 @@ impl CompareCommand {
         }
         self.check_names()?;
         let config = self.settings.effective()?;
-        let csv = self.make_places()?;
+        self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = learners::read(checkpoints, &self.device.open()?)?;
         let numbers: Vec<Option<u32>> = match self.robots.as_slice() {
@@ -133,7 +133,7 @@ impl CompareCommand {
             report.baseline = self.baseline(arena.model(), arena.lacks_model(), policies)?;
             report.add(axis_label(arena.model()), results);
         }
-        self.write_results(&report, added, &config, csv)
+        self.write_results(&report, added, &config)
     }
 
     fn write_results(
@@ -141,17 +141,12 @@ impl CompareCommand {
         report: &Report,
         added: Vec<PolicyRun>,
         config: &AgentConfig,
-        csv: Option<RunsFile>,
     ) -> Result<()> {
-        let fits = check_fire(&added, &report.runs);
-        // The rows of this comparison are written even if the added rows are refused.
-        let added = if fits.is_ok() { added } else { Vec::new() };
         let all = [&*report.runs, &*added].concat();
         write(&render_table(&all, &report.baseline))?;
-        if let Some(csv) = csv {
-            csv.replace(&all)?;
+        if let Some(csv) = &self.csv {
+            write_runs(csv, &all)?;
         }
-        fits?;
         if let Some(directory) = &self.tensorboard {
             write_events(directory, &report.runs)?;
         }
@@ -189,22 +184,15 @@ impl CompareCommand {
         let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
         let policies = comparison.policies.iter();
         let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
-        let worlds = CommonWorlds {
-            fingerprint: info.worlds_fingerprint.clone(),
-            seeds: comparison.seeds.clone().collect(),
-            steps: comparison.steps,
-            moves: Some(info.n_moves),
-            robots: Some(robots),
-            recent_steps: Some(comparison.recent_steps),
-        };
+        let worlds = comparison.worlds(info);
         check_added(&added, &policies, &worlds).context("--add")
     }
 
-    /// Locks the CSV file and creates the folders for figures and events.
-    fn make_places(&self) -> Result<Option<RunsFile>> {
+    /// Checks the CSV file and creates the folders for figures and events.
+    fn make_places(&self) -> Result<()> {
         let folders = [self.figures.as_deref(), self.tensorboard.as_deref()];
         folders.into_iter().flatten().try_for_each(make_folder)?;
-        lock_csv(self.csv.as_deref())
+        self.csv.as_deref().map_or(Ok(()), check_csv)
     }
 
     /// Returns the policies to run in an arena. If the arena has no model, the ladder keeps only policies that need

@@ -2,10 +2,10 @@
 
 use super::shared::write;
 use crate::benchmark::report::leaderboard::{
-    About, Entry, check_entries, file_stem, read_entries, render_page,
+    About, Entry, check_entries, read_entries, render_page,
 };
 use crate::benchmark::report::leaderboard_chart::draw_leaderboard;
-use crate::benchmark::report::runs_file::read_runs;
+use crate::benchmark::report::runs_file::{file_of, read_runs};
 use crate::benchmark::report::suite::TaskRuns;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -71,76 +71,56 @@ impl LeaderboardCommand {
     fn add(&self, folder: &Path) -> Result<()> {
         let text = |flag: &Option<String>| flag.clone().unwrap_or_default();
         let policy = text(&self.policy);
-        let files =
-            std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
-        let files = files
-            .map(|file| Ok(file?.path()))
-            .collect::<Result<BTreeSet<_>>>()?;
-        let files = files
-            .iter()
-            .filter(|path| path.extension().is_some_and(|it| it == "csv"));
-        let tasks = files
-            .map(|path| task(path, &policy))
-            .collect::<Result<Vec<_>>>()?;
-        let tasks: Vec<TaskRuns> = tasks
-            .into_iter()
-            .filter(|task| !task.runs.is_empty())
-            .collect();
+        let tasks = tasks(folder, &policy)?;
         ensure!(
             !tasks.is_empty(),
-            "--add {}: expected results of {:?}, got none",
-            folder.display(),
-            policy
+            "--add {}: expected results of {policy:?}, got none",
+            folder.display()
         );
+        let recorded = tasks.iter().map(|task| task.runs[0].training_seconds).sum();
         let about = About {
-            training_seconds: self.training_seconds(&tasks)?,
+            training_seconds: self.training_seconds.or(recorded).context(
+                "--training-seconds: expected a number, as the rows of a task have none",
+            )?,
             policy,
             by: text(&self.by),
             code: text(&self.code),
             commit: text(&self.commit),
         };
-        let path = self
-            .entries
-            .join(format!("{}.csv", file_stem(&about.policy)));
         let entry = Entry { about, tasks };
         entry.check()?;
         let mut entries = read_entries(&self.entries)?;
         entries.retain(|other| other.about.policy != entry.about.policy);
-        let mut others = entries.iter().map(|other| &other.about.policy);
-        let same = others.find(|other| file_stem(other) == file_stem(&entry.about.policy));
-        ensure!(
-            same.is_none(),
-            "--policy {}: its file name is taken by the entry of {}: choose another name",
-            entry.about.policy,
-            same.unwrap_or(&entry.about.policy)
-        );
+        let file = file_of(&entry.about.policy);
+        for other in &entries {
+            ensure!(
+                file_of(&other.about.policy) != file,
+                "--policy {}: its file name is taken by the entry of {}: choose another name",
+                entry.about.policy,
+                other.about.policy
+            );
+        }
         entries.push(entry.clone());
         check_entries(&entries)?;
-        entry.write(&path)
-    }
-
-    /// Returns the value of `--training-seconds`. Without the flag, sums the training seconds recorded for each task.
-    fn training_seconds(&self, tasks: &[TaskRuns]) -> Result<f64> {
-        if let Some(seconds) = self.training_seconds {
-            return Ok(seconds);
-        }
-        let seconds = tasks.iter().map(|task| {
-            let seconds = task.runs[0].training_seconds;
-            seconds.with_context(|| {
-                format!(
-                    "--training-seconds: expected a number, as the rows of task {} have none",
-                    task.task
-                )
-            })
-        });
-        seconds.sum()
+        entry.write(&self.entries.join(file))
     }
 }
 
-/// Reads a policy's runs from a task's file.
-fn task(path: &Path, policy: &str) -> Result<TaskRuns> {
-    let name = path.file_stem().unwrap_or_default().display().to_string();
-    let mut runs = read_runs(path)?;
-    runs.retain(|run| run.policy == policy);
-    Ok(TaskRuns { task: name, runs })
+/// Reads a policy's runs in the folder of each task.
+fn tasks(folder: &Path, policy: &str) -> Result<Vec<TaskRuns>> {
+    let folders =
+        std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
+    let folders = folders.map(|entry| Ok(entry?.path()));
+    let mut tasks = Vec::new();
+    for folder in folders.collect::<Result<BTreeSet<_>>>()? {
+        let path = folder.join(file_of(policy));
+        if path.is_file() {
+            let task = folder.file_name().unwrap_or_default().display().to_string();
+            let mut runs = read_runs(&path)?;
+            runs.retain(|run| run.policy == policy);
+            tasks.push(TaskRuns { task, runs });
+        }
+    }
+    tasks.retain(|task| !task.runs.is_empty());
+    Ok(tasks)
 }

@@ -1,6 +1,6 @@
 //! Helpers of several subcommands: waiting for a server, models by name, output files.
 
-use crate::benchmark::report::RunsFile;
+use crate::benchmark::report::runs_file::check_runs_file;
 use crate::client::info::wait_for_server;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -102,14 +102,12 @@ pub fn make_folder(path: &Path) -> Result<()> {
         .with_context(|| format!("create {}: {expected}", path.display()))
 }
 
-/// Creates the folder of the `--csv` file and locks the file until it is written, so that errors are found before the
-/// work begins.
-pub fn lock_csv(path: Option<&Path>) -> Result<Option<RunsFile>> {
-    let lock = |path: &Path| {
-        make_folder_of(path).with_context(|| path.display().to_string())?;
-        RunsFile::lock(path, Duration::ZERO)
-    };
-    path.map(lock).transpose().context("--csv")
+/// Creates the folder of the `--csv` file and checks that the file can be written, before the work begins.
+pub fn check_csv(path: &Path) -> Result<()> {
+    make_folder_of(path)
+        .with_context(|| path.display().to_string())
+        .and_then(|()| check_runs_file(path))
+        .context("--csv")
 }
 
 pub fn write(text: &str) -> Result<()> {

@@ -16,28 +16,32 @@ pub struct PolicyRun {
     pub world_seed: u64,
     pub steps: u64,
     pub mean_reward: f64,
-    /// Mean number of distinct cells visited in a step.
+    /// Mean number of distinct cells visited in a step. Entries of the leaderboard lack this and other columns with a
+    /// default.
+    #[serde(default)]
     pub mean_distinct_cells: f64,
     /// Share of the distinct visited cells that are in the state with the highest reward, in `0..=1`.
+    #[serde(default)]
     pub hit_rate: f64,
     /// Mean number of burning cells of the world.
+    #[serde(default)]
     pub mean_fire_cells: f64,
     /// Mean time of one plan in milliseconds.
+    #[serde(default)]
     pub mean_plan_millis: f64,
     /// Mean Brier score of the belief; `None` without a belief.
     pub brier: Option<f64>,
+    #[serde(default)]
     pub moves: usize,
     /// Number of robots in the world. Rewards and cells are the team's: a cell that several robots visit in a step counts
     /// once. Planning times are summed over the world's agents.
-    #[serde(default = "one")]
     pub robots: u32,
-    #[serde(default = "alone")]
     pub team: String,
     /// Share of the robots' visits to distinct cells that repeat a teammate's visit in the same step, in `0..1`.
     #[serde(default)]
     pub mean_repeated: f64,
     /// Steps until a robot first visited a burning cell, `None` if never. This and the next five fields are defined in
-    /// `docs/figures-of-merit.md`, and are missing in old files.
+    /// `docs/figures-of-merit.md`.
     pub steps_to_detection: Option<u64>,
     /// Number of burning cells in the world at that step.
     pub burning_cells_at_detection: Option<u32>,
@@ -51,10 +55,9 @@ pub struct PolicyRun {
     pub grid_seen_share: Option<f64>,
     /// Mean `ln P(y)` of a visited cell under the prediction made before the frame; `None` if nothing is predicted.
     pub log_likelihood: Option<f64>,
-    /// The server's `worlds_fingerprint`; empty in files of earlier releases.
-    #[serde(default)]
+    /// The server's `worlds_fingerprint`.
     pub worlds_fingerprint: String,
-    /// Identifies everything the policy's actions depend on, except the worlds; empty in files of earlier releases.
+    /// Identifies everything the policy's actions depend on, except the worlds; empty unless `suite` ran the policy.
     #[serde(default)]
     pub policy_fingerprint: String,
     /// Processor seconds of training for the world's task, if `suite` recorded them.
@@ -65,14 +68,6 @@ pub struct PolicyRun {
     /// Reward of each step, in order.
     #[serde(skip)]
     pub rewards: Vec<f32>,
-}
-
-fn one() -> u32 {
-    1
-}
-
-fn alone() -> String {
-    ALONE.into()
 }
 
 /// The runs of one policy with one estimator and one kind of team, in the order given.

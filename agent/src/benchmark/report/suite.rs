@@ -8,7 +8,6 @@ use crate::benchmark::report::columns::markdown;
 use crate::benchmark::report::number::{NOTHING, number};
 use crate::benchmark::report::policy_run::PolicyRun;
 use crate::benchmark::report::statistics::Estimate;
-use comfy_table::Table;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::collections::{BTreeMap, BTreeSet};
@@ -24,6 +23,10 @@ const SCORES: &str = "Scores: 0 is random_walk's mean reward in a task, 1 is ora
 
 /// Heading of the table of policies that lack a task.
 pub(super) const PARTIAL: &str = "Policies that lack a task have no score over all tasks:";
+
+const LIKELIHOOD: &str = "Log-likelihood of a visited cell (higher is better):";
+
+const BRIER: &str = "Brier score (lower is better):";
 
 /// Number of bootstrap draws for an interval.
 const N_DRAWS: usize = 10_000;
@@ -50,6 +53,9 @@ pub struct Aggregate {
     /// `None` if a task has only one world, whose spread is unknown.
     pub interval: Option<[f64; 2]>,
 }
+
+/// A policy with its score over tasks; `None` if it lacks a task.
+pub type Scored<'a> = (&'a str, Option<Aggregate>);
 
 impl Aggregate {
     /// Computes the score from the rewards in each task's worlds; `None` if a task has no scores.
@@ -120,70 +126,67 @@ impl TaskRuns {
 /// Policies that lack a task have a separate table.
 pub fn render_suite(tasks: &[TaskRuns]) -> String {
     let policies = by_score(tasks);
-    let scores = policies.iter().map(|(policy, score)| {
-        let mean = |task: &TaskRuns| {
-            let mean = Estimate::of(&task.scores(policy));
-            mean.map_or(NOTHING.into(), |it| number(it.mean, 3))
-        };
-        let cells = tasks.iter().map(mean).chain(score.map(score_text));
-        (score.is_some(), row(policy, cells))
-    });
-    let (complete, partial) = by_completeness(scores);
-    let belief = |value: fn(&PolicyRun) -> Option<f64>| {
-        let policies = policies.iter();
-        let rows = policies.filter_map(|(policy, _)| belief_row(tasks, policy, value));
-        table(tasks, None, rows.collect())
+    let (complete, partial) = by_completeness(&policies);
+    let scores = |policies: &[Scored<'_>]| {
+        let rows = policies.iter().map(|(policy, score)| {
+            let mean = |task: &TaskRuns| Estimate::of(&task.scores(policy));
+            let cells = tasks
+                .iter()
+                .map(|task| cell(mean(task).map(|it| it.mean), 3));
+            row(policy, cells.chain(score.map(score_text)))
+        });
+        rows.collect()
     };
-    let beliefs = [
-        (
-            "Log-likelihood of a visited cell (higher is better):",
-            belief(|run| run.log_likelihood),
-        ),
-        ("Brier score (lower is better):", belief(|run| run.brier)),
+    let beliefs = |value: fn(&PolicyRun) -> Option<f64>| {
+        let rows = policies.iter().filter_map(|(policy, _)| {
+            let means: Vec<_> = tasks.iter().map(|task| task.mean(policy, value)).collect();
+            let is_any = means.iter().any(Option::is_some);
+            is_any.then(|| row(policy, means.into_iter().map(|mean| cell(mean, 4))))
+        });
+        rows.collect()
+    };
+    let parts = [
+        table(SCORES, tasks, Some("score [95 %]"), scores(complete)),
+        table(PARTIAL, tasks, None, scores(partial)),
+        table(LIKELIHOOD, tasks, None, beliefs(|run| run.log_likelihood)),
+        table(BRIER, tasks, None, beliefs(|run| run.brier)),
     ];
-    let scores = [
-        (SCORES, table(tasks, Some("score [95 %]"), complete)),
-        (PARTIAL, table(tasks, None, partial)),
-    ];
-    let parts = scores.into_iter().chain(beliefs);
-    let parts = parts.filter_map(|(words, table)| Some(format!("{words}\n\n{}\n", table?)));
-    parts.collect::<Vec<_>>().join("\n")
+    parts.into_iter().flatten().collect::<Vec<_>>().join("\n")
 }
 
-/// Returns the row of a policy's means in each task; `None` if it has no value in any task.
-fn belief_row(
+/// Returns a heading and a table with one column per task; `None` without rows.
+fn table(
+    heading: &str,
     tasks: &[TaskRuns],
-    policy: &str,
-    value: fn(&PolicyRun) -> Option<f64>,
-) -> Option<Vec<String>> {
-    let means: Vec<Option<f64>> = tasks.iter().map(|task| task.mean(policy, value)).collect();
-    let cell = |mean: &Option<f64>| mean.map_or(NOTHING.into(), |mean| number(mean, 4));
-    let is_any = means.iter().any(Option::is_some);
-    is_any.then(|| row(policy, means.iter().map(cell)))
+    last: Option<&str>,
+    rows: Vec<Vec<String>>,
+) -> Option<String> {
+    if rows.is_empty() {
+        return None;
+    }
+    let names = tasks.iter().map(|task| &*task.task);
+    let columns: Vec<&str> = ["policy"].into_iter().chain(names).chain(last).collect();
+    let table = markdown(&columns, rows.into_iter());
+    Some(format!("{heading}\n\n{table}\n"))
 }
 
-/// Returns a table with one column per task; `None` without rows.
-fn table(tasks: &[TaskRuns], last: Option<&str>, rows: Vec<Vec<String>>) -> Option<Table> {
-    let names = tasks.iter().map(|task| &*task.task);
-    let headings: Vec<&str> = ["policy"].into_iter().chain(names).chain(last).collect();
-    (!rows.is_empty()).then(|| markdown(&headings, rows.into_iter()))
+fn cell(mean: Option<f64>, decimals: usize) -> String {
+    mean.map_or(NOTHING.into(), |mean| number(mean, decimals))
 }
 
 fn row(policy: &str, cells: impl Iterator<Item = String>) -> Vec<String> {
     [policy.to_owned()].into_iter().chain(cells).collect()
 }
 
-/// Separates the rows of policies that have all tasks from the other rows.
-pub(super) fn by_completeness(
-    rows: impl Iterator<Item = (bool, Vec<String>)>,
-) -> (Vec<Vec<String>>, Vec<Vec<String>>) {
-    let (complete, partial): (Vec<_>, Vec<_>) = rows.partition(|(is_complete, _)| *is_complete);
-    let rows = |rows: Vec<(bool, _)>| rows.into_iter().map(|(_, row)| row).collect();
-    (rows(complete), rows(partial))
+/// Separates the policies that have all tasks from the other policies, which come last.
+pub(super) fn by_completeness<'a, 'b>(
+    policies: &'b [Scored<'a>],
+) -> (&'b [Scored<'a>], &'b [Scored<'a>]) {
+    policies.split_at(policies.partition_point(|(_, score)| score.is_some()))
 }
 
 /// Returns all policies with their scores over tasks, the highest first. Policies that lack a task come last, by name.
-pub fn by_score(tasks: &[TaskRuns]) -> Vec<(&str, Option<Aggregate>)> {
+pub fn by_score(tasks: &[TaskRuns]) -> Vec<Scored<'_>> {
     let names = tasks
         .iter()
         .flat_map(|task| task.runs.iter().map(|run| &*run.policy));
