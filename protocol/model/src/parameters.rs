@@ -72,12 +72,11 @@ impl Model {
     /// # Errors
     /// If the radius is over 8.
     pub fn with_radius(self, radius: usize) -> Result<Self, ModelError> {
-        let mut file = self.file;
-        if radius == 0 && file.sensor.is_none() {
-            return Self::new(file);
-        }
-        file.sensor = Some(SensorEntry { radius });
-        Self::new(file)
+        let sensor = (radius > 0).then_some(SensorEntry { radius });
+        Self::new(ModelFile {
+            sensor,
+            ..self.file
+        })
     }
 
     /// Checks a model file and lays out its arrays.

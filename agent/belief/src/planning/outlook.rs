@@ -85,34 +85,27 @@ impl Outlook {
             return outlook;
         };
         let closed = no_fly.iter().enumerate().filter(|(_, closed)| **closed);
-        outlook.without_visits(&closed.map(|(cell, _)| cell).collect::<Vec<_>>())
+        outlook.cleared(&closed.map(|(cell, _)| cell).collect::<Vec<_>>(), &[])
     }
 
-    /// Sets layers to 0 in visited cells, except the layers that count in all cells in sight.
-    fn without_visits(mut self, visited: &[usize]) -> Self {
+    /// Sets layers to 0 in the cells that another robot visits. Layers that count in all cells in sight are set to 0 in
+    /// the cells that the other robot sees.
+    pub fn without(self, visited: &[usize]) -> Self {
+        let seen = self.airspace.see(visited);
+        self.cleared(visited, &seen)
+    }
+
+    /// Sets layers to 0 in `visited` cells, or in `seen` cells if they count in all cells in sight.
+    fn cleared(mut self, visited: &[usize], seen: &[usize]) -> Self {
         for layer in Layer::ALL {
-            if !self.counts_in_sight(layer) {
-                let cells = self.layers[layer as usize].as_slice_mut();
-                let cells = cells.expect("invariant: grids are row-major");
-                visited.iter().for_each(|&cell| cells[cell] = 0.0);
-            }
+            let in_sight = self.counts_in_sight(layer);
+            let cells = self.layers[layer as usize].as_slice_mut();
+            let cells = cells.expect("invariant: grids are row-major");
+            let cleared = if in_sight { seen } else { visited };
+            cleared.iter().for_each(|&cell| cells[cell] = 0.0);
         }
         self.sums = self.layers.each_ref().map(Sums::of);
         self
-    }
-
-    /// Sets layers to 0 in the cells that another robot visits. Layers that count in all cells in sight are also set to
-    /// 0 in the cells that the other robot sees.
-    pub fn without(mut self, visited: &[usize]) -> Self {
-        let seen = self.airspace.see(visited);
-        for layer in Layer::ALL {
-            if self.counts_in_sight(layer) {
-                let cells = self.layers[layer as usize].as_slice_mut();
-                let cells = cells.expect("invariant: grids are row-major");
-                seen.iter().for_each(|&cell| cells[cell] = 0.0);
-            }
-        }
-        self.without_visits(visited)
     }
 
     pub fn shape(&self) -> Shape {

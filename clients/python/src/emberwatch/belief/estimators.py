@@ -85,7 +85,7 @@ def load(
         kind: A learned kind of `kinds`, such as ``"learned+spatial"``. None: the kind that the
             checkpoint was trained for.
         model: The model of the worlds, required by ``"neural+sensor"``. If given, the checkpoint
-            must have the same number of observed values and observation matrices.
+            must have the same number of observed values.
         n_worlds: Number of worlds, at least 1. None: a single world, and arrays without an axis
             for worlds.
 

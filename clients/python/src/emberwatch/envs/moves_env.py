@@ -75,10 +75,10 @@ class WildfireMovesEnv(WorldEnv):
 
     With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
     the world moves. The last move's reward also includes a correction, so that the rewards of a
-    path sum to the robot's share of the path's true reward, as with `"share"`. The correction is small for a lone robot, as one
-    step changes few cells. But `"move"` reveals more about the hidden state than `"share"` does,
-    and earlier, so results with the two rewards are not comparable. `"move"` needs the hidden
-    states: with `instance`, the server must publish them.
+    path sum to the robot's share of the path's true reward, as with `"share"`. The correction is
+    small for a lone robot, as one step changes few cells. But `"move"` reveals more about the
+    hidden state than `"share"` does, and earlier, so results with the two rewards are not
+    comparable. `"move"` needs the hidden states: with `instance`, the server must publish them.
 
     ## Episode End
 

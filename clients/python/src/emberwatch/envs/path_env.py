@@ -58,18 +58,18 @@ class WildfireEnv(WorldEnv):
 
     The last channel of `image` is for unobserved cells. With a `sensor_radius` of r, or a sensor in
     the model file, the robot also observes cells up to r rows and columns away from its path. O is
-    the number of the model's observations times the number of the sensor's observation matrices.
-    `belief` is the known model's Bayes filter (paper equations 5 and 6): the distribution of the
-    state that the next path will observe, given all frames so far. Its prior is the default of
-    `wrappers.BeliefObservation`.
+    the number of the model's observations. `belief` is the known model's Bayes filter (paper
+    equations 5 and 6): the distribution of the state that the next path will observe, given all
+    frames so far. Its prior is the default of `wrappers.BeliefObservation`.
 
     ## Rewards
 
     In the wildfire model, the number of distinct visited cells that burn after the world has moved.
     In general, the sum of the model's rewards over the distinct visited cells. The start cell
-    counts only if the path returns to it. In a world of several robots, `reward` chooses between `"share"` (the default: a cell that v robots
-    visited pays each of them 1 / v), `"team"` (the reward of all robots together), and `"marginal"`
-    (how much lower the team's reward would be without this robot).
+    counts only if the path returns to it. In a world of several robots, `reward` chooses between
+    `"share"` (the default: a cell that v robots visited pays each of them 1 / v), `"team"` (the
+    reward of all robots together), and `"marginal"` (how much lower the team's reward would be
+    without this robot).
 
     ## One Robot of a Team
 
