@@ -32,9 +32,13 @@ impl Place {
         Self(folder)
     }
 
-    fn suite(&self, flags: &str) -> Ended {
+    fn words(&self, flags: &str) -> String {
         let [task, out] = ["tiny.toml", "out"].map(|name| self.0.word(name));
-        agent(&format!("suite --tasks {task} --out {out} {flags}"))
+        format!("suite --tasks {task} --out {out} {flags}")
+    }
+
+    fn suite(&self, flags: &str) -> Ended {
+        agent(&self.words(flags))
     }
 
     fn rows(&self, policy: &str) -> Vec<PolicyRun> {
@@ -63,8 +67,10 @@ impl Place {
     }
 }
 
-fn rewards(rows: &[PolicyRun]) -> Vec<f64> {
-    rows.iter().map(|run| run.mean_reward).collect()
+/// Splits a line of a table.
+fn columns<const N: usize>(line: &str) -> [&str; N] {
+    let columns: Vec<&str> = line.split(" => ").collect();
+    columns.try_into().expect("as many columns")
 }
 
 #[test]
@@ -84,9 +90,13 @@ fn a_suite_keeps_equal_rows_and_its_results_make_a_page() {
         .suite("--worlds 2")
         .check_says("2 rows of coverage kept");
     assert_eq!(place.rows("coverage"), rows);
-    let wide = rewards(&place.rows("beam_exploit"));
+    let rewards = || -> Vec<f64> {
+        let rows = place.rows("beam_exploit");
+        rows.iter().map(|run| run.mean_reward).collect()
+    };
+    let wide = rewards();
     place.suite("--policies coverage,beam_exploit --beam-width 2");
-    assert_ne!(rewards(&place.rows("beam_exploit")), wide);
+    assert_ne!(rewards(), wide);
     // A program with one more byte stands for a program built from changed files.
     let mut program = std::fs::read(program_path(SERVER)).expect("a program");
     program.push(0);
@@ -114,21 +124,13 @@ fn a_suite_keeps_equal_rows_and_its_results_make_a_page() {
     check(AGENT, &place.entry("mine"), none);
     let named = place.entry("coverage").replace("--by us", "--by <svg>");
     check(AGENT, &named, "by: expected 1 to 200 letters");
-    for (name, from, to, words) in [
-        (
-            "coverage",
-            ",40,",
-            ",41,",
-            "world 0: steps: expected 40, got 41",
-        ),
-        ("coverage", ",none,", ",<b>none</b>,", "estimator: expected"),
-        (
-            "oracle_ahead",
-            ",alone,",
-            ",shared,",
-            "task tiny: expected team alone, as in the entry of random_walk, got shared",
-        ),
-    ] {
+    for line in "\
+coverage => ,40, => ,41, => expected world 0 for 40 steps | got world 0 for 41 steps
+coverage => ,none, => ,<b>none</b>, => estimator: expected
+oracle_ahead => ,alone, => ,shared, => task tiny: expected team alone, as in the entry of random_walk, got shared"
+        .lines()
+    {
+        let [name, from, to, words] = columns(line);
         let file = format!("entries/{name}.csv");
         let entry = place.0.text(&file);
         let changed = entry.replacen(from, to, if name == "coverage" { 1 } else { 9 });
@@ -163,39 +165,27 @@ fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
         agent(&place.entry(policy));
     }
     let (page, rows) = (place.0.text("page.md"), place.0.text("out/tiny/python.csv"));
-    for (from, to, what) in [
-        (
-            "burn_in = 300",
-            "burn_in = 50",
-            "python\" on world 0: worlds_fingerprint",
-        ),
-        (
-            "max_steps = 40",
-            "max_steps = 41",
-            "python\" on world 0: steps: expected 41, got 40",
-        ),
-    ] {
+    for line in "\
+burn_in = 300 => burn_in = 50 => world 0 for 40 steps, worlds_fingerprint
+max_steps = 40 => max_steps = 41 => world 0 for 41 steps, worlds_fingerprint"
+        .lines()
+    {
+        let [from, to, what] = columns(line);
+        let of_python = format!("policy \"python\": expected {what}");
         place.0.write("tiny.toml", TASK.replacen(from, to, 1));
         let changed = place.suite("--policies coverage");
-        changed.check_says("coverage is run: policy \"coverage\" on world 0: ");
-        changed.check_says(&format!("python is left out: policy \"{what}"));
+        changed.check_says("coverage is run: policy \"coverage\": expected world 0 ");
+        changed.check_says(&format!("python is left out: {of_python}"));
         assert!(!changed.stdout.contains("python"), "{}", changed.stdout);
         assert_eq!(place.0.text("out/tiny/python.csv"), rows, "none are lost");
-        check(AGENT, &compare, &format!("--add: policy \"{what}"));
+        check(AGENT, &compare, &format!("--add: {of_python}"));
         check(AGENT, &place.entry("coverage"), "entry coverage, task tiny");
         assert!(!place.0.path("entries/coverage.csv").exists());
         assert_eq!(place.0.text("page.md"), page);
     }
     place.0.write("out/tiny/python.csv", "policy\nmine\n");
-    check(
-        AGENT,
-        &format!(
-            "suite --tasks {} --out {}",
-            place.0.word("tiny.toml"),
-            place.0.word("out")
-        ),
-        "task tiny: | out/tiny/python.csv: expected a CSV file",
-    );
+    let words = "task tiny: | out/tiny/python.csv: expected a CSV file";
+    check(AGENT, &place.words(""), words);
 }
 
 #[test]

@@ -43,19 +43,6 @@ pub fn named(name: &str) -> Result<&'static LearnerKind, String> {
     })
 }
 
-/// Finds the learner that writes a kind of checkpoint.
-///
-/// # Errors
-/// If there is no such kind. The error lists all kinds of checkpoint.
-pub fn of_checkpoint(name: &str) -> Result<&'static LearnerKind> {
-    let mut kinds = LEARNERS.iter().copied();
-    let kind = kinds.find(|kind| kind.checkpoint == name);
-    kind.with_context(|| {
-        let names = listed(LEARNERS.iter().map(|kind| kind.checkpoint));
-        format!("expected a checkpoint of one of the kinds {names}, got {name}")
-    })
-}
-
 /// Reads the learned values from checkpoints, at most one checkpoint of each kind. Networks compute on `device`.
 pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>, device: &Device) -> Result<Learned> {
     let mut learned = Learned::default();
@@ -76,7 +63,12 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Learned> {
 }
 
 fn add(learned: &mut Learned, name: &str, contents: &Contents, device: &Device) -> Result<()> {
-    let kind = of_checkpoint(name)?;
+    let mut kinds = LEARNERS.iter();
+    let kind = kinds.find(|kind| kind.checkpoint == name);
+    let kind = kind.with_context(|| {
+        let names = listed(LEARNERS.iter().map(|kind| kind.checkpoint));
+        format!("expected a checkpoint of one of the kinds {names}, got {name}")
+    })?;
     let is_other = (kind.read)(contents, device, learned)?;
     ensure!(!is_other, "expected one checkpoint of {name}, got two");
     learned.digests.push(contents.digest());

@@ -2,7 +2,7 @@
 
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::PolicyRun;
-use crate::benchmark::report::common_worlds::CommonWorlds;
+use crate::benchmark::report::common_worlds::World;
 use crate::benchmark::team::Team;
 use crate::benchmark::world_run::WorldRun;
 use crate::client::view::view;
@@ -121,14 +121,14 @@ impl Comparison {
         self.teams.iter().map(n_policies).sum()
     }
 
-    /// Returns what the rows of this comparison have in common.
-    pub fn worlds(&self, info: &ServerInfo) -> CommonWorlds {
-        CommonWorlds {
-            fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
-            seeds: self.seeds.clone().collect(),
+    /// Returns the worlds that each policy's rows have, in ascending order.
+    pub fn worlds(&self, info: &ServerInfo) -> Vec<World> {
+        let world = |seed| World {
+            seed,
             steps: self.steps,
-            recent_steps: Some(self.recent_steps),
-        }
+            fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
+        };
+        self.seeds.clone().map(world).collect()
     }
 
     /// Returns each policy with each kind of team, but the oracle team only once.

@@ -22,5 +22,5 @@ pub mod training;
 
 pub use self::events::write_events;
 pub use self::figures::{draw_ladder, draw_rewards, draw_teams, save};
-pub use self::policy_run::{ALONE, PolicyRun};
+pub use self::policy_run::{ALONE, PolicyRun, groups};
 pub use self::table::render_table;

@@ -4,11 +4,11 @@ use super::shared::{asks_for_help, check_csv, make_folder, write};
 use super::worlds::WorldFlags;
 use crate::benchmark::arena::Arena;
 use crate::benchmark::compare::{Comparison, Results, compare};
-use crate::benchmark::report::common_worlds::check_added;
+use crate::benchmark::report::common_worlds::check_worlds;
 use crate::benchmark::report::runs_file::{read_runs, write_runs};
 use crate::benchmark::report::{
-    PolicyRun, draw_ladder, draw_rewards, draw_teams, figures::FIRE_CELLS_PER_STEP, render_table,
-    write_events,
+    PolicyRun, draw_ladder, draw_rewards, draw_teams, figures::FIRE_CELLS_PER_STEP, groups,
+    render_table, write_events,
 };
 use crate::benchmark::team::Team;
 use crate::client::launch::OwnDashboard;
@@ -182,10 +182,24 @@ impl CompareCommand {
         let robots = info.n_robots;
         let is_here = |run: &&PolicyRun| run.robots == robots || !self.robots.contains(&run.robots);
         let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
-        let policies = comparison.policies.iter();
-        let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
-        let worlds = comparison.worlds(info);
-        check_added(&added, &policies, &worlds).context("--add")
+        let recent_steps = Some(comparison.recent_steps);
+        for group in groups(&added) {
+            let policy = group.policy;
+            let mut own = comparison.policies.iter();
+            ensure!(
+                own.all(|own| own.name != policy),
+                "--add: policy {policy:?}: expected a name that no compared policy has"
+            );
+            check_worlds(policy, &group.runs, &comparison.worlds(info)).context("--add")?;
+            ensure!(
+                group
+                    .runs
+                    .iter()
+                    .all(|run| run.recent_steps == recent_steps),
+                "--add: policy {policy:?}: expected rows with the same --recent-steps"
+            );
+        }
+        Ok(())
     }
 
     /// Checks the CSV file and creates the folders for figures and events.

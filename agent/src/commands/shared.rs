@@ -87,12 +87,6 @@ pub fn read_model(path: &Path) -> Result<Model> {
     Model::read(path).with_context(|| format!("model file {}", path.display()))
 }
 
-/// Creates the folder of an output file.
-pub fn make_folder_of(path: &Path) -> Result<()> {
-    let parent = path.parent().filter(|parent| *parent != Path::new(""));
-    parent.map_or(Ok(()), make_folder)
-}
-
 /// Creates a folder for output files, and checks that it is writable.
 pub fn make_folder(path: &Path) -> Result<()> {
     let expected = "expected a writable folder, or a path where one can be created";
@@ -104,8 +98,9 @@ pub fn make_folder(path: &Path) -> Result<()> {
 
 /// Creates the folder of the `--csv` file and checks that the file can be written, before the work begins.
 pub fn check_csv(path: &Path) -> Result<()> {
-    make_folder_of(path)
-        .with_context(|| path.display().to_string())
+    let parent = path.parent().filter(|parent| *parent != Path::new(""));
+    let made = parent.map_or(Ok(()), make_folder);
+    made.with_context(|| path.display().to_string())
         .and_then(|()| check_runs_file(path))
         .context("--csv")
 }

@@ -8,7 +8,7 @@ use super::trainings::{Lesson, Trainings};
 use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
 use crate::benchmark::report::PolicyRun;
-use crate::benchmark::report::common_worlds::CommonWorlds;
+use crate::benchmark::report::common_worlds::{World, check_worlds};
 use crate::benchmark::report::runs_file::{csv_files, file_of, read_runs, write_runs};
 use crate::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
 use crate::benchmark::team::Team;
@@ -191,7 +191,7 @@ impl SuiteCommand {
         if missing.is_empty() {
             return Ok(runs);
         }
-        let n_worlds = plan.worlds.seeds.len() as u32;
+        let n_worlds = plan.worlds.len() as u32;
         let (mut arena, _server) = self.open(plan.task, &plan.comparison.seeds, n_worlds)?;
         for (policy, lesson, fingerprint) in missing {
             let comparison = Comparison {
@@ -257,7 +257,7 @@ impl SuiteCommand {
 struct Plan<'a> {
     task: &'a Task,
     policies: Vec<Policy>,
-    worlds: CommonWorlds,
+    worlds: Vec<World>,
     /// The comparison, without policies and checkpoints.
     comparison: Comparison,
     form: WorldForm,
@@ -282,7 +282,7 @@ impl Plan<'_> {
     fn rows(&self, policy: &str, fingerprint: &str) -> Result<Vec<PolicyRun>> {
         let found = self.found.iter().filter(|run| run.policy == policy);
         let found: Vec<&PolicyRun> = found.collect();
-        self.worlds.check(policy, &found)?;
+        check_worlds(policy, &found, &self.worlds)?;
         ensure!(
             found
                 .iter()

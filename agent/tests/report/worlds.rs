@@ -2,7 +2,7 @@
 
 use super::synthetic::run;
 use emberwatch_agent::benchmark::report::PolicyRun;
-use emberwatch_agent::benchmark::report::common_worlds::{CommonWorlds, check_added};
+use emberwatch_agent::benchmark::report::common_worlds::{World, check_worlds};
 use emberwatch_agent::benchmark::report::leaderboard::{About, Entry};
 use emberwatch_agent::benchmark::report::suite::TaskRuns;
 use serde::Serialize;
@@ -15,53 +15,48 @@ fn changed<T: Serialize + DeserializeOwned>(value: &T, line: &str) -> T {
     table.try_into().expect("of the same type")
 }
 
-fn worlds() -> CommonWorlds {
-    CommonWorlds {
-        fingerprint: "884869f24f9fd933".into(),
-        seeds: vec![0, 1, 2],
-        steps: 4,
-        recent_steps: Some(10),
-    }
-}
-
 fn runs() -> Vec<PolicyRun> {
     (0..3).map(|seed| run("mine", "none", seed, 1.0)).collect()
 }
 
-fn check(worlds: &CommonWorlds, runs: &[PolicyRun]) -> Result<(), String> {
+fn check(runs: &[PolicyRun]) -> Result<(), String> {
+    let worlds: Vec<World> = self::runs().iter().map(World::of).collect();
     let runs: Vec<&PolicyRun> = runs.iter().collect();
-    let checked = worlds.check("mine", &runs);
-    checked.map_err(|error| format!("{error:#}"))
+    check_worlds("mine", &runs, &worlds).map_err(|error| format!("{error:#}"))
 }
 
 #[test]
 fn runs_of_other_worlds_are_refused_with_what_differs() {
-    assert_eq!(check(&worlds(), &runs()), Ok(()));
-    for refused in "\
-steps = 5 | steps: expected 4, got 5
-recent_steps = 25 | --recent-steps: expected 10, got 25
-worlds_fingerprint = '0123456789abcdef' | expected 884869f24f9fd933, got 0123456789abcdef
-worlds_fingerprint = '' | expected 884869f24f9fd933, got none
-world_seed = 2 | one row for each world, 3 from seed 0 to 2, got 3 from seed 0 to 2"
-        .lines()
-    {
-        let (change, words) = refused.split_once(" | ").expect("two columns");
+    assert_eq!(check(&runs()), Ok(()));
+    for (change, words) in [
+        (
+            "steps = 5",
+            "expected world 1 for 4 steps, | got world 1 for 5 steps",
+        ),
+        (
+            "worlds_fingerprint = 'ab'",
+            "_fingerprint \"884869f24f9fd933\", | got world 1 | \"ab\"",
+        ),
+        (
+            "worlds_fingerprint = ''",
+            "got world 1 for 4 steps, worlds_fingerprint \"\"",
+        ),
+        ("world_seed = 2", "expected world 1 | got world 2"),
+    ] {
         let mut runs = runs();
         runs[1] = changed(&runs[1], change);
-        let refusal = check(&worlds(), &runs).expect_err(words);
+        let refusal = check(&runs).expect_err(words);
         assert!(refusal.starts_with("policy \"mine\""), "{refusal}");
-        assert!(refusal.contains(words), "{refusal}");
+        assert!(
+            words.split(" | ").all(|words| refusal.contains(words)),
+            "{refusal}"
+        );
     }
-    let refusal = check(&worlds(), &runs()[..2]).expect_err("two of three");
-    let words = "one row for each world, 3 from seed 0 to 2, got 2 from seed 0 to 1";
-    assert!(refusal.contains(words), "{refusal}");
-}
-
-#[test]
-fn an_added_policy_has_a_name_of_its_own() {
-    check_added(&runs(), &["coverage"], &worlds()).expect("the same worlds");
-    let error = check_added(&runs(), &["mine"], &worlds()).expect_err("one name for two");
-    assert!(error.to_string().contains("\"mine\""), "{error}");
+    let refusal = check(&runs()[..2]).expect_err("two of three");
+    assert!(
+        refusal.contains("each of 3 worlds, got 2 rows"),
+        "{refusal}"
+    );
 }
 
 #[test]

@@ -1,77 +1,53 @@
 //! Checks that runs can be compared: that they were measured on the same worlds, over the same steps.
 
-use crate::benchmark::report::policy_run::{PolicyRun, groups};
+use crate::benchmark::report::policy_run::PolicyRun;
 use anyhow::{Result, ensure};
-use std::fmt::Display;
+use std::fmt::{Display, Formatter};
 
-/// The worlds that runs of a comparison, a task or the leaderboard must have in common.
-#[derive(Debug, Clone)]
-pub struct CommonWorlds {
+/// A world in which a run was measured, and what was measured.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct World {
+    pub seed: u64,
+    pub steps: u64,
     /// The server's `worlds_fingerprint`.
     pub fingerprint: String,
-    /// World seeds, in ascending order.
-    pub seeds: Vec<u64>,
-    pub steps: u64,
-    /// Steps for which a cell counts as seen after a visit; `None` skips this check.
-    pub recent_steps: Option<u32>,
 }
 
-impl CommonWorlds {
-    /// Checks that a policy has one run for each of these worlds.
-    pub fn check(&self, policy: &str, runs: &[&PolicyRun]) -> Result<()> {
-        for run in runs {
-            let (expected, got) = (&self.fingerprint, &run.worlds_fingerprint);
-            let what = "worlds_fingerprint (model, grid, sensor, moves, robots, start, burn-in)";
-            ensure!(
-                !got.is_empty(),
-                "policy {policy:?}: {what}: expected {expected}, got none"
-            );
-            same(run, what, expected, got)?;
-            same(run, "steps", self.steps, run.steps)?;
-            if let (Some(expected), Some(got)) = (self.recent_steps, run.recent_steps) {
-                same(run, "--recent-steps", expected, got)?;
-            }
+impl World {
+    pub fn of(run: &PolicyRun) -> Self {
+        Self {
+            seed: run.world_seed,
+            steps: run.steps,
+            fingerprint: run.worlds_fingerprint.clone(),
         }
-        let mut found: Vec<u64> = runs.iter().map(|run| run.world_seed).collect();
-        found.sort_unstable();
+    }
+}
+
+impl Display for World {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let (seed, steps, fingerprint) = (self.seed, self.steps, &self.fingerprint);
+        write!(
+            f,
+            "world {seed} for {steps} steps, worlds_fingerprint {fingerprint:?}"
+        )
+    }
+}
+
+/// Checks that a policy has one run for each of the worlds, which are in ascending order.
+pub fn check_worlds(policy: &str, runs: &[&PolicyRun], worlds: &[World]) -> Result<()> {
+    let mut found: Vec<World> = runs.iter().map(|run| World::of(run)).collect();
+    found.sort();
+    for (expected, got) in worlds.iter().zip(&found) {
         ensure!(
-            found == self.seeds,
-            "policy {policy:?}: expected one row for each world, {}, got {}",
-            counted(&self.seeds),
-            counted(&found)
+            expected == got,
+            "policy {policy:?}: expected {expected}, got {got}: run it on the same worlds (model, grid, sensor, \
+             moves, robots, start, burn-in)"
         );
-        Ok(())
     }
-}
-
-/// Checks runs from other files before a comparison of `policies` starts.
-pub fn check_added(added: &[PolicyRun], policies: &[&str], worlds: &CommonWorlds) -> Result<()> {
-    for group in groups(added) {
-        ensure!(
-            !policies.contains(&group.policy),
-            "policy {:?}: expected a name that no compared policy has",
-            group.policy
-        );
-        worlds.check(group.policy, &group.runs)?;
-    }
-    Ok(())
-}
-
-/// Describes worlds by their number and their first and last seed.
-fn counted(seeds: &[u64]) -> String {
-    match seeds {
-        [] => "none".into(),
-        [first, .., last] => format!("{} from seed {first} to {last}", seeds.len()),
-        [only] => format!("1 of seed {only}"),
-    }
-}
-
-fn same<T: PartialEq + Display>(run: &PolicyRun, what: &str, expected: T, got: T) -> Result<()> {
+    let (expected, got) = (worlds.len(), found.len());
     ensure!(
         expected == got,
-        "policy {:?} on world {}: {what}: expected {expected}, got {got}: run it on the same worlds",
-        run.policy,
-        run.world_seed
+        "policy {policy:?}: expected one row for each of {expected} worlds, got {got} rows"
     );
     Ok(())
 }

@@ -1,7 +1,7 @@
 //! Entries of the leaderboard, one CSV file each, and the page of all entries.
 
 use crate::benchmark::report::columns::markdown;
-use crate::benchmark::report::common_worlds::CommonWorlds;
+use crate::benchmark::report::common_worlds::{World, check_worlds};
 use crate::benchmark::report::number::{NOTHING, number};
 use crate::benchmark::report::policy_run::PolicyRun;
 use crate::benchmark::report::runs_file::csv_files;
@@ -169,14 +169,9 @@ pub fn check_entries(entries: &[Entry]) -> Result<()> {
 
 /// Checks an entry's runs on a task against the random walk's.
 fn check_runs(policy: &str, runs: &[PolicyRun], floor: &[PolicyRun]) -> Result<()> {
-    let seeds: BTreeSet<u64> = floor.iter().map(|run| run.world_seed).collect();
-    let worlds = CommonWorlds {
-        fingerprint: floor[0].worlds_fingerprint.clone(),
-        seeds: seeds.into_iter().collect(),
-        steps: floor[0].steps,
-        recent_steps: None,
-    };
-    worlds.check(policy, &runs.iter().collect::<Vec<_>>())?;
+    let worlds: BTreeSet<World> = floor.iter().map(World::of).collect();
+    let runs_found: Vec<&PolicyRun> = runs.iter().collect();
+    check_worlds(policy, &runs_found, &Vec::from_iter(worlds))?;
     let [expected, got] = [floor, runs].map(|runs| joined(runs.iter().map(|run| &*run.team)));
     ensure!(
         policy != CEILING || expected == got,

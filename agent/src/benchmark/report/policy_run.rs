@@ -71,12 +71,12 @@ pub struct PolicyRun {
 }
 
 /// The runs of one policy with one estimator and one kind of team, in the order given.
-pub(super) struct Group<'a> {
-    pub(super) policy: &'a str,
+pub struct Group<'a> {
+    pub policy: &'a str,
     pub(super) estimator: &'a str,
     pub(super) robots: u32,
     pub(super) team: &'a str,
-    pub(super) runs: Vec<&'a PolicyRun>,
+    pub runs: Vec<&'a PolicyRun>,
 }
 
 impl Group<'_> {
@@ -121,7 +121,7 @@ impl Group<'_> {
 }
 
 /// Groups runs by policy, estimator, robots and team, ordered by first appearance.
-pub(super) fn groups(runs: &[PolicyRun]) -> Vec<Group<'_>> {
+pub fn groups(runs: &[PolicyRun]) -> Vec<Group<'_>> {
     let mut groups: Vec<Group<'_>> = Vec::new();
     for run in runs {
         let (policy, estimator) = (run.policy.as_str(), run.estimator.as_str());
