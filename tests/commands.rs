@@ -68,6 +68,8 @@ compare --instance nobody --policies coverage,ash => policy: expected one of ran
 compare --instance x --height 9 => --instance | --height
 compare TINY --csv /proc/no/file.csv => create /proc/no
 compare TINY --csv / => --csv: write /: expected a regular file, got a folder
+compare TINY --csv /dev/null => --csv: write /dev/null: expected a regular file
+compare TINY --csv /dev/null/rows.csv => --csv: /dev/null/rows.csv: create /dev/null
 compare TINY --figures /proc => create /proc: expected a writable folder
 "#;
 
