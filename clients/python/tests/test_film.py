@@ -221,8 +221,8 @@ def test_a_recording_of_release_0_2_is_drawn_with_its_belief(tmp_path: Path) -> 
     film = tmp_path / "old.png"
     main([str(OLD), "--step", "8", "--prior", "uniform", "--scale", "10", "--out", str(film)])
     with Image.open(film) as image:
+        # Four panels: truth, frame, belief and entropy.
         assert image.width == 14 + 4 * (160 + 16) - 16 + 14
-    # Truth, frame, belief and entropy: four panels.
 
 
 def test_a_cut_recording_is_shown_up_to_the_cut(studio: Studio) -> None:
