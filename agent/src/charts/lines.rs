@@ -231,12 +231,14 @@ impl Panel {
             chart.draw_series([PathElement::new(zero, INK.stroke_width(2))])?;
         }
         for (curve, color) in self.curves.iter().zip(COLORS) {
-            let band = curve.points.iter().filter(|point| point.error > 0.0);
-            let lower = band.clone().map(|point| (point.x, point.y - point.error));
-            let upper = band.rev().map(|point| (point.x, point.y + point.error));
-            let band: Vec<(f64, f64)> = lower.chain(upper).collect();
-            if !band.is_empty() {
-                chart.draw_series([Polygon::new(band, color.mix(0.18))])?;
+            // A band ends where a point has none.
+            let bands = curve.points.chunk_by(|a, b| a.error > 0.0 && b.error > 0.0);
+            for band in bands.filter(|band| band.len() > 1) {
+                let lower = band.iter().map(|point| (point.x, point.y - point.error));
+                let upper = band.iter().rev();
+                let upper = upper.map(|point| (point.x, point.y + point.error));
+                let edge: Vec<(f64, f64)> = lower.chain(upper).collect();
+                chart.draw_series([Polygon::new(edge, color.mix(0.18))])?;
             }
         }
         let mut ends = Vec::new();

@@ -143,10 +143,10 @@ impl CompareCommand {
         config: &AgentConfig,
     ) -> Result<()> {
         let all = [&*report.runs, &*added].concat();
-        write(&render_table(&all, &report.baseline))?;
         if let Some(csv) = &self.csv {
             write_runs(csv, &all)?;
         }
+        write(&render_table(&all, &report.baseline))?;
         if let Some(directory) = &self.tensorboard {
             write_events(directory, &report.runs)?;
         }

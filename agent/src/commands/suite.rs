@@ -4,7 +4,7 @@
 
 use super::compare::run_comparison;
 use super::shared::{asks_for_help, make_folder, write};
-use super::trainings::{Lesson, Trainings};
+use super::trainings::{Trained, Trainings};
 use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
 use crate::benchmark::report::PolicyRun;
@@ -122,10 +122,11 @@ impl SuiteCommand {
         let policies = self.policies(arena.model())?;
         let folder = self.out.join(&task.name);
         make_folder(&folder)?;
-        let files = csv_files(&folder)?;
-        let found = files.iter().map(|file| read_runs(file));
-        let mut found = found.collect::<Result<Vec<_>>>()?.concat();
-        found.retain(|run| seeds.contains(&run.world_seed));
+        let mut found = Vec::new();
+        for file in csv_files(&folder)? {
+            let runs = read_runs(&file)?;
+            found.push((file, runs));
+        }
         let several = task.robots > 1;
         let comparison = Comparison {
             policies: Vec::new(),
@@ -168,23 +169,23 @@ impl SuiteCommand {
         let (task, mut runs, mut missing) = (&plan.task.name, plan.of_others(), Vec::new());
         for policy in &plan.policies {
             let name = &policy.name;
-            let lesson = match self.prepare(plan, policy) {
-                Ok(lesson) => lesson,
+            let trained = match self.prepare(plan, policy) {
+                Ok(trained) => trained,
                 Err(reason) if is_outage(&reason) => return Err(reason),
                 Err(reason) => {
                     tracing::warn!("task {task}: {name} is not run: {reason:#}");
                     continue;
                 }
             };
-            let fingerprint = plan.fingerprint(policy, &lesson.learned);
-            match plan.rows(name, &fingerprint) {
+            let fingerprint = plan.fingerprint(policy, &trained.learned);
+            match plan.kept(policy, &fingerprint) {
                 Ok(rows) => {
                     tracing::info!("task {task}: {} rows of {name} kept", rows.len());
                     runs.extend(rows);
                 }
                 Err(reason) => {
                     tracing::info!("task {task}: {name} is run: {reason:#}");
-                    missing.push((policy, lesson, fingerprint));
+                    missing.push((policy, trained, fingerprint));
                 }
             }
         }
@@ -192,38 +193,44 @@ impl SuiteCommand {
             return Ok(runs);
         }
         let n_worlds = plan.worlds.len() as u32;
-        let (mut arena, _server) = self.open(plan.task, &plan.comparison.seeds, n_worlds)?;
-        for (policy, lesson, fingerprint) in missing {
+        let (mut arena, server) = self.open(plan.task, &plan.comparison.seeds, n_worlds)?;
+        let is_same = plan.comparison.worlds(arena.info()) == plan.worlds;
+        ensure!(
+            is_same && server.build()? == plan.build,
+            "the programs or the task's files have changed since the command began: run it again"
+        );
+        for (policy, trained, fingerprint) in missing {
             let comparison = Comparison {
                 policies: vec![policy.clone()],
-                learned: lesson.learned,
+                learned: trained.learned,
                 ..plan.comparison.clone()
             };
             let mut new = run_comparison(&mut arena, &comparison)?.runs;
             for run in &mut new {
-                run.training_seconds = lesson.seconds;
+                run.training_seconds = trained.seconds;
                 run.policy_fingerprint.clone_from(&fingerprint);
             }
-            write_runs(&plan.folder.join(file_of(&policy.name)), &new)?;
+            write_runs(&plan.file_of(policy), &new)?;
             runs.extend(new);
         }
         Ok(runs)
     }
 
     /// Reads a policy's checkpoints. With `--train`, first runs the missing trainings.
-    fn prepare(&self, plan: &Plan<'_>, policy: &Policy) -> Result<Lesson> {
+    fn prepare(&self, plan: &Plan<'_>, policy: &Policy) -> Result<Trained> {
         ensure!(
             !(plan.task.is_recorded() && policy.belief.knows_model),
             "it needs a known model, and recorded worlds have none"
         );
-        let file = file_of(&policy.name);
-        let mut others = plan.found.iter().filter(|run| run.policy != policy.name);
+        let is_own =
+            |run: &PolicyRun| run.policy == policy.name && !run.policy_fingerprint.is_empty();
         ensure!(
-            others.all(|run| file_of(&run.policy) != file),
-            "{file} has rows of another policy"
+            plan.rows_in_file_of(policy).iter().all(is_own),
+            "{} has rows of another policy or program: move the file",
+            plan.file_of(policy).display()
         );
         if !policy.needs_checkpoint() {
-            return Ok(Lesson {
+            return Ok(Trained {
                 learned: Learned::default(),
                 seconds: Some(0.0),
             });
@@ -264,7 +271,8 @@ struct Plan<'a> {
     /// Digest of the programs.
     build: String,
     folder: PathBuf,
-    found: Vec<PolicyRun>,
+    /// The files of the folder, with their rows.
+    found: Vec<(PathBuf, Vec<PolicyRun>)>,
 }
 
 impl Plan<'_> {
@@ -278,31 +286,49 @@ impl Plan<'_> {
         hash[..8].iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Returns the rows of a policy that were found, if they are from this task's worlds and have this fingerprint.
-    fn rows(&self, policy: &str, fingerprint: &str) -> Result<Vec<PolicyRun>> {
-        let found = self.found.iter().filter(|run| run.policy == policy);
-        let found: Vec<&PolicyRun> = found.collect();
-        check_worlds(policy, &found, &self.worlds)?;
+    /// Returns the path of a policy's rows.
+    fn file_of(&self, policy: &Policy) -> PathBuf {
+        self.folder.join(file_of(&policy.name))
+    }
+
+    fn rows_in_file_of(&self, policy: &Policy) -> &[PolicyRun] {
+        let file = self.file_of(policy);
+        let found = self.found.iter().find(|(path, _)| *path == file);
+        found.map_or(&[], |(_, runs)| runs)
+    }
+
+    /// Returns the rows in a policy's file, if they are from this task's worlds and have this fingerprint.
+    fn kept(&self, policy: &Policy, fingerprint: &str) -> Result<Vec<PolicyRun>> {
+        let rows = self.checked(&policy.name, self.rows_in_file_of(policy))?;
         ensure!(
-            found
-                .iter()
-                .all(|run| run.policy_fingerprint == fingerprint),
+            rows.iter().all(|run| run.policy_fingerprint == fingerprint),
             "its rows are from another build, checkpoint or settings"
         );
-        Ok(found.into_iter().cloned().collect())
+        Ok(rows)
+    }
+
+    /// Returns the rows of a policy on this suite's seeds, if there is one for each of the task's worlds.
+    fn checked(&self, policy: &str, rows: &[PolicyRun]) -> Result<Vec<PolicyRun>> {
+        let seeds = &self.comparison.seeds;
+        let is_here = |run: &&PolicyRun| run.policy == policy && seeds.contains(&run.world_seed);
+        let rows: Vec<&PolicyRun> = rows.iter().filter(is_here).collect();
+        check_worlds(policy, &rows, &self.worlds)?;
+        Ok(rows.into_iter().cloned().collect())
     }
 
     /// Returns the rows of other programs' policies, which have no fingerprint. Warns about policies that were measured
     /// on other worlds, and leaves them out.
     fn of_others(&self) -> Vec<PolicyRun> {
-        let others = self.found.iter().filter(|run| {
+        let rows = self.found.iter().flat_map(|(_, runs)| runs);
+        let rows = rows.filter(|run| {
             let is_own = |policy: &Policy| policy.name == run.policy;
             run.policy_fingerprint.is_empty() && !self.policies.iter().any(is_own)
         });
-        let others: BTreeSet<&str> = others.map(|run| &*run.policy).collect();
+        let rows: Vec<PolicyRun> = rows.cloned().collect();
+        let others: BTreeSet<&str> = rows.iter().map(|run| &*run.policy).collect();
         let mut runs = Vec::new();
         for policy in others {
-            match self.rows(policy, "") {
+            match self.checked(policy, &rows) {
                 Ok(rows) => runs.extend(rows),
                 Err(reason) => {
                     let task = &self.task.name;

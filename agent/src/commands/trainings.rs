@@ -6,7 +6,7 @@
 use super::shared::make_folder;
 use super::train::{N_WORLDS, learn, start_server};
 use crate::training::{CHECKPOINT, TrainingSpec, seconds};
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use emberwatch_learning::beliefs::WorldForm;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
@@ -17,7 +17,7 @@ use emberwatch_learning::policy::Policy;
 use emberwatch_learning::rollout::building;
 use emberwatch_network::Device;
 use emberwatch_protocol::task::{FIRST_TRAINING_SEED, Task};
-use std::fs::{remove_dir_all, rename};
+use std::fs::rename;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -29,8 +29,8 @@ pub struct Trainings<'a> {
     pub policy: &'a Policy,
 }
 
-/// What a policy's trainings left.
-pub struct Lesson {
+/// What a policy's trainings produced: its checkpoints and their training time.
+pub struct Trained {
     pub learned: Learned,
     /// Processor seconds of the trainings; `None` if one of them has no record.
     pub seconds: Option<f64>,
@@ -41,14 +41,14 @@ impl Trainings<'_> {
     ///
     /// # Errors
     /// If a checkpoint is missing or cannot be used, or if decisions were not learned on the belief next to them.
-    pub fn read(&self, world: &WorldForm) -> Result<Lesson> {
+    pub fn read(&self, world: &WorldForm) -> Result<Trained> {
         let folders: Vec<PathBuf> = self.folders().map(|(_, folder)| folder).collect();
         let seconds = folders.iter().map(|folder| seconds::read(folder));
         let seconds = seconds.collect::<Result<Vec<_>>>()?;
-        let learned = read(&folders)?;
+        let learned = read(folders.iter())?;
         building::check(self.policy, &learned, world)?;
         let seconds = seconds.into_iter().sum();
-        Ok(Lesson { learned, seconds })
+        Ok(Trained { learned, seconds })
     }
 
     /// Runs the trainings that have no checkpoint. `steps`: world steps of each, summed over its worlds; `None`: the
@@ -62,16 +62,23 @@ impl Trainings<'_> {
         steps: Option<u64>,
         server: &Option<PathBuf>,
     ) -> Result<()> {
-        let mut before = Vec::new();
-        for (learner, folder) in self.folders() {
-            if !folder.join(CHECKPOINT).exists() {
-                let (task, policy) = (&self.task.name, &self.policy.name);
-                tracing::info!("task {task}: training {learner} for {policy}");
-                let spec = self.spec(learner, config, steps, read(&before)?)?;
-                let trained = self.train(spec, &folder, server.clone());
-                trained.with_context(|| format!("train --learner {learner}"))?;
+        let folders: Vec<(&str, PathBuf)> = self.folders().collect();
+        for (index, (learner, folder)) in folders.iter().enumerate() {
+            if folder.join(CHECKPOINT).exists() {
+                continue;
             }
-            before.push(folder);
+            // Decisions are of no use with another belief than theirs.
+            let mut later = folders[index..].iter().map(|(_, folder)| folder);
+            if let Some(other) = later.find(|folder| folder.exists()) {
+                let (other, folder) = (other.display(), folder.display());
+                bail!("{other} is in the way of the training for {folder}: remove it");
+            }
+            let (task, policy) = (&self.task.name, &self.policy.name);
+            tracing::info!("task {task}: training {learner} for {policy}");
+            let before = folders[..index].iter().map(|(_, folder)| folder);
+            let spec = self.spec(learner, config, steps, read(before)?)?;
+            let trained = self.train(spec, folder, server.clone());
+            trained.with_context(|| format!("train --learner {learner}"))?;
         }
         Ok(())
     }
@@ -114,7 +121,7 @@ impl Trainings<'_> {
             steps,
             deadline: None,
             resume: false,
-            out: self.folder.join("training"),
+            out: self.folder.join(format!("training.{}", std::process::id())),
             freeze: false,
             device: Device::Cpu,
             config,
@@ -124,9 +131,6 @@ impl Trainings<'_> {
 
     /// Trains in a temporary folder, and renames it when the training is complete.
     fn train(&self, spec: TrainingSpec, folder: &Path, server: Option<PathBuf>) -> Result<()> {
-        for old in [&*spec.out, folder].into_iter().filter(|old| old.exists()) {
-            remove_dir_all(old).with_context(|| format!("remove {}", old.display()))?;
-        }
         make_folder(&spec.out)?;
         let worlds = spec.worlds.len().to_string();
         let (task, seed) = (&self.task.source, FIRST_TRAINING_SEED.to_string());
@@ -137,7 +141,7 @@ impl Trainings<'_> {
     }
 }
 
-fn read(folders: &[PathBuf]) -> Result<Learned> {
-    let places: Vec<PathBuf> = folders.iter().map(|it| it.join(CHECKPOINT)).collect();
+fn read<'a>(folders: impl Iterator<Item = &'a PathBuf>) -> Result<Learned> {
+    let places: Vec<PathBuf> = folders.map(|it| it.join(CHECKPOINT)).collect();
     learners::read(places.iter().map(PathBuf::as_path), &Device::Cpu)
 }

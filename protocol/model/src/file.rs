@@ -219,13 +219,13 @@ pub enum ModelError {
 impl From<toml::de::Error> for ModelError {
     /// Adds advice if the text contains a key of earlier releases.
     fn from(error: toml::de::Error) -> Self {
-        let is_gone =
-            |key: &&str| error.message() == format!("unknown field `{key}`, expected `radius`");
         let mut text = error.to_string();
-        if let Some(key) = ["rings", "pays"].into_iter().find(is_gone) {
-            text += &format!(
-                "remove `{key}`: a sensor has one observation matrix, and rewards are for visited cells\n"
-            );
+        if ["`rings`", "`pays`"]
+            .iter()
+            .any(|key| error.message().contains(key))
+        {
+            text += "`rings` and `pays` are gone, remove both: a sensor has one observation matrix, and rewards are for \
+                     visited cells\n";
         }
         Self::Toml(text)
     }

@@ -5,7 +5,7 @@ use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::rewards::rewards;
 use crate::benchmark::report::statistics::Estimate;
 use crate::benchmark::report::teams::teams;
-use crate::charts::{Bar, Ladder, RGBColor};
+use crate::charts::{Bar, Ladder, Point, RGBColor};
 use anyhow::{Result, bail, ensure};
 use emberwatch_learning::beliefs::{self, LEARNED};
 use emberwatch_learning::file::{Readers, replace_file};
@@ -21,6 +21,17 @@ const SHOOTING: (&str, RGBColor) = ("known model, shooting", RGBColor(0x56, 0xb4
 
 /// Legend and colour of rows from `--add`.
 const ADDED: (&str, RGBColor) = ("added", RGBColor(0xcc, 0x79, 0xa7));
+
+impl Estimate {
+    /// Returns the estimate as a point of a curve, with the standard error as its band.
+    pub fn at(self, x: f64) -> Point {
+        Point {
+            x,
+            y: self.mean,
+            error: self.standard_error.unwrap_or(0.0),
+        }
+    }
+}
 
 /// Writes an SVG page to `path`.
 pub fn save(path: &Path, svg: &str) -> Result<()> {

@@ -3,7 +3,6 @@
 //! A world is one sample. Its steps are too correlated to count as samples: the share of burning cells decorrelates
 //! over thousands of steps. So every standard error here is over worlds.
 
-use crate::charts::Point;
 use std::collections::BTreeMap;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,15 +30,6 @@ impl Estimate {
             standard_error,
             n_worlds,
         })
-    }
-
-    /// Returns the estimate as a point of a curve, with the standard error as its band.
-    pub fn at(self, x: f64) -> Point {
-        Point {
-            x,
-            y: self.mean,
-            error: self.standard_error.unwrap_or(0.0),
-        }
     }
 
     /// Estimates the mean of `values - baseline` over the worlds that both have; `None` if they share none.

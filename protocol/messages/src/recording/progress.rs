@@ -14,7 +14,7 @@ use std::fmt::Display;
 #[derive(Debug, Default)]
 pub(super) struct Progress {
     /// Protocol version of the samples.
-    version: u32,
+    pub(super) version: u32,
     pub(super) nanos: u64,
     server: Option<Limits>,
     pub(super) totals: Totals,

@@ -115,7 +115,7 @@ impl<R: Read> Reader<R> {
         if header.kind == Kind::End as u32 {
             return self.check_end(&body).map_err(damaged).map(|()| None);
         }
-        if header.kind == Kind::Server as u32 {
+        if header.kind == Kind::Server as u32 && self.progress.version == 2 {
             check_sensor(&body)?;
         }
         let record = Record {
