@@ -183,6 +183,10 @@ max_steps = 40 => max_steps = 41 => world 0 for 41 steps, worlds_fingerprint"
         assert!(!place.0.path("entries/coverage.csv").exists());
         assert_eq!(place.0.text("page.md"), page);
     }
+    place.0.write("out/tiny/coverage.csv", &rows);
+    let kept = place.suite("--policies coverage");
+    kept.check_says("coverage.csv has rows of another policy or program: move the file");
+    assert_eq!(place.0.text("out/tiny/coverage.csv"), rows);
     place.0.write("out/tiny/python.csv", "policy\nmine\n");
     let words = "task tiny: | out/tiny/python.csv: expected a CSV file";
     check(AGENT, &place.words(""), words);
@@ -207,7 +211,8 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     // A training that was killed leaves nothing that counts.
     let flags = "--train --train-steps 100000000";
     let killed = Program::start(AGENT, &words(flags));
-    killed.until(|| folder.path("runs/tiny/training").exists());
+    let training = folder.path(&format!("runs/tiny/training.{}", killed.pid()));
+    killed.until(|| training.exists());
     killed.wait_for_words("learning");
     killed.signal(Signal::INT);
     killed.wait(LIMIT);
@@ -227,7 +232,6 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
         assert!(seconds("neural_beam") > 0.0);
         assert!(seconds("learned_policy") >= seconds("learned_beam"));
         assert_eq!(seconds("random_walk"), 0.0);
-        assert!(!folder.path(&format!("runs/{task}/training")).exists());
     }
     // Complete trainings stay, whatever the flags.
     let again = suite("--train --train-steps 96");
@@ -243,6 +247,10 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     // Without a checkpoint, a training begins anew.
     std::fs::remove_file(checkpoint("tiny")).expect("removed");
     suite("").check_says("learned_beam is not run: checkpoint ");
+    // A folder that this command did not make stays.
+    let refused = suite("--train --train-steps 64");
+    refused.check_says("filter is in the way of the training for");
+    std::fs::remove_dir_all(folder.path("runs/tiny/filter")).expect("removed");
     let anew = suite("--train --train-steps 64");
     anew.check_says("task tiny: training filter for learned_beam");
     assert!(checkpoint("tiny").exists());

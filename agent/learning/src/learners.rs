@@ -67,7 +67,7 @@ fn add(learned: &mut Learned, name: &str, contents: &Contents, device: &Device) 
     let kind = kinds.find(|kind| kind.checkpoint == name);
     let kind = kind.with_context(|| {
         let names = listed(LEARNERS.iter().map(|kind| kind.checkpoint));
-        format!("expected a checkpoint of one of the kinds {names}, got {name}")
+        format!("expected a checkpoint of one of the kinds {names}, got {name}: train it again")
     })?;
     let is_other = (kind.read)(contents, device, learned)?;
     ensure!(!is_other, "expected one checkpoint of {name}, got two");

@@ -33,7 +33,7 @@ fn a_policy_has_one_run_for_each_world() {
         (vec![first, second], "each of 3 worlds, got 2 rows"),
         (
             vec![first, second, second, third],
-            "expected world 2 for 4 steps",
+            "expected a row for world 2, got one for world 1",
         ),
         (
             vec![first, &changed(second, "steps = 5"), third],

@@ -156,6 +156,8 @@ def test_an_interrupted_evaluation_leaves_the_finished_rows(file: Path) -> None:
     with pytest.raises(KeyboardInterrupt) as stopped:
         go(file, "other", stops_in_the_last_world(interrupt), append=True)
     check(stopped.value)
+    Path(f"{file}.partial").touch()
+    go(file, "third", up, append=True)
     with pytest.raises(ZeroDivisionError) as raised:
         go(None, policy=stops_in_the_last_world(lambda: 1 / 0))
     with pytest.raises(ZeroDivisionError):
@@ -218,7 +220,7 @@ def test_files_of_other_programs_are_read(file: Path) -> None:
     ]
     file.write_text("".join(lines))
     assert read(file) == rows[:3]
-    with refuses("csv: expected .*mine.csv to have the columns policy,.*, got others"):
+    with refuses("csv: expected .*mine.csv to have the columns of evaluate, got other ones: new"):
         go(file, "other", append=True)
     bad = ("mine,none,3", "mine" + ",1" * 60, "mine,none,x" + ",1" * 20)
     for content in (*(f"{text}{line}\n" for line in bad), "policy,steps\nmine,3\n", "\x00\xff"):
@@ -242,6 +244,10 @@ def test_a_suite_writes_one_file_for_each_task_and_policy(tmp_path: Path) -> Non
             suite(up, name=name, tasks=[source], **keywords)
     with refuses("tasks: expected tasks with different names, got small, small"):
         suite(up, name="new", tasks=["small", "small"], **keywords)
+    with refuses("tasks: expected at least one task, got none"):
+        suite(up, name="new", tasks=[], **keywords)
+    with refuses("append: expected a file in csv, got none"):
+        go(None, append=True)
     with refuses("append: suite sets it; leave it out"):
         suite(up, name="new", append=True, **keywords)
 

@@ -21,7 +21,7 @@ from emberwatch.model.airspace import Airspace
 
 INFO = document.examples()[1] | {"n_robots": 2, "deadline_millis": 0}
 TOTALS = {"n_servers": 1, "n_frames": 2, "n_truths": 1, "n_lost_frames": 3, "n_lost_truths": 0}
-#: A recording of release 0.2, whose protocol has version 2.
+#: A recording of protocol version 2.
 OLD = Path(__file__).parents[3] / "tests/data/version-2.recording"
 FILE_HEADER = struct.pack("=8sII", b"EMBERREC", 3, 0)
 
@@ -85,7 +85,7 @@ def test_a_recording_is_read_in_order_with_lost_samples(path: Path) -> None:
     assert list(recording.read(path, world=1)) == []
 
 
-def test_recordings_of_release_0_2_are_read_unless_their_sensor_has_rings(path: Path) -> None:
+def test_recordings_of_version_2_are_read_unless_their_sensor_has_rings(path: Path) -> None:
     good = OLD.read_bytes()
     frames = [it for it in read(path, good, strict=True) if isinstance(it.sample, Frame)]
     assert len(frames) == 10 and frames[-1].sample.result.step == 8

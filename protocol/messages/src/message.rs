@@ -108,8 +108,7 @@ pub struct WorldResult {
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of the rewards of the distinct cells that any robot visited, each
-    /// in its state in `X_{k+1}`.
+    /// Sum of the rewards of the distinct cells that any robot visited, each in its state in `X_{k+1}`.
     pub reward: f64,
     /// Bit r is set if no client held robot r of the world. A robot that nobody holds stays in its cell and sees
     /// nothing.

@@ -42,7 +42,7 @@ class InvalidArgumentError(EmberwatchError, ValueError):
 
 
 class ExistingFileError(InvalidArgumentError, FileExistsError):
-    """A file exists already. It was not changed."""
+    """Raised if a file of results would replace an existing file."""
 
 
 def invalid(subject: object, expected: object, got: object) -> InvalidArgumentError:

@@ -1,8 +1,8 @@
 //! Observation noise: draws a sensor's reading of each observed cell (paper eq. 1).
 //!
 //! A reading is a pure function of (seed, step, cell), so two agents that observe the same cell in the same step get
-//! the same reading. One ChaCha8 draw gives a key for the step, and SplitMix64 with this key generates
-//! each cell's random number. So the cost is constant per observed cell, and other cells cost nothing.
+//! the same reading. One ChaCha8 draw gives a key for the step, and SplitMix64 with this key generates each cell's random
+//! number. So the cost is constant per observed cell, and other cells cost nothing.
 
 use emberwatch_model::randomness::{Purpose, split_mix, stream};
 use emberwatch_model::{Frame, Grid, Model};

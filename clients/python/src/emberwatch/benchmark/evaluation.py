@@ -92,8 +92,9 @@ def evaluate(
             for example `lambda worlds: VecFrameStack(worlds, 4)`. For a saved model with normalized
             observations: `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`. The
             evaluation does not change the statistics of the normalization.
-        csv: A new file for the rows, written after the last world. If the evaluation ends early,
-            the rows of the finished worlds are written to this path with `.partial` at its end.
+        csv: The file for the rows, written after the last world. If the evaluation ends early, the
+            rows of the finished worlds replace the file with `.partial` after this path, until the
+            next evaluation that does not end early removes it.
         append: Whether `csv` may exist. The rows are added to its rows, which must be of other
             policies on the same worlds.
         progress: The stream for progress; None: no output.
@@ -103,7 +104,14 @@ def evaluate(
 
     Returns:
         One row for each seed, in order.
+
+    Raises:
+        ExistingFileError: If `csv` exists, unless `append` is true.
+        InvalidArgumentError: If an argument is invalid, the policy does not fit the worlds, or the
+            file cannot be written.
     """
+    if append and csv is None:
+        raise invalid("append", "a file in csv", "none")
     task = None if keywords.get("task") is None else Task.named(keywords["task"])
     seeds = (task.test_seeds if task else _SEEDS) if seeds is None else seeds
     steps = (task.max_steps if task else _STEPS) if steps is None else steps

@@ -42,25 +42,26 @@ class RowFile:
         self.path: Final = Path(os.path.realpath(utf8("csv", path)))
         self._append, self._policy, self._worlds = append, policy, worlds
         self._present()
-        temporary = _temporary(self.path)
-        with self._problems():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.touch()
-            temporary.unlink()
+        check_writable(self.path)
 
     def save(self, rows: Sequence[Row]) -> None:
         """Writes the file, with the rows that it already had first.
+
+        Removes the partial file of an earlier evaluation.
 
         Raises:
             InvalidArgumentError: If the file cannot be written, or has changed meanwhile.
         """
         self._replace(self.path, [*self._present(), *rows], is_new=not self._append)
+        self._partial().unlink(missing_ok=True)
 
     def save_partial(self, rows: Sequence[Row]) -> Path:
         """Writes the rows of an evaluation that did not finish. Returns the path of their file."""
-        path = self.path.with_name(f"{self.path.name}.partial")
-        self._replace(path, rows, is_new=False)
-        return path
+        self._replace(self._partial(), rows, is_new=False)
+        return self._partial()
+
+    def _partial(self) -> Path:
+        return self.path.with_name(f"{self.path.name}.partial")
 
     def _present(self) -> list[Row]:
         """Returns the rows of the file; checks that rows can be added to them."""
@@ -71,10 +72,14 @@ class RowFile:
                 f"csv: {self.path} already exists: choose another file, or add rows to a file of "
                 "rows with append=True"
             )
-        with self._problems():
+        with _problems(self.path, "read"):
             rows = read(self.path)
-            if self.path.read_text("utf-8-sig").splitlines()[:1] not in ([], [HEADER]):
-                raise invalid("csv", f"{self.path} to have the columns {HEADER}", "others")
+            header = self.path.read_text("utf-8-sig").partition("\n")[0].rstrip("\r")
+        if header not in ("", HEADER):
+            others = {*header.split(",")} ^ {*HEADER.split(",")}
+            got = ", ".join(sorted(others)) or "another order"
+            expected = f"{self.path} to have the columns of evaluate"
+            raise invalid("csv", expected, f"other ones: {got}")
         worlds: dict[str, set[tuple[str, int, int]]] = {}
         for row in rows:
             world = (row.worlds_fingerprint, row.world_seed, row.steps)
@@ -92,25 +97,48 @@ class RowFile:
 
     def _replace(self, path: Path, rows: Sequence[Row], *, is_new: bool) -> None:
         temporary = _temporary(path)
-        with self._problems():
+        with _problems(self.path, "written"):
             try:
-                temporary.write_text(text_of(rows), encoding="utf-8", newline="")
+                with temporary.open("w", encoding="utf-8", newline="") as file:
+                    file.write(text_of(rows))
+                    file.flush()
+                    os.fsync(file.fileno())
                 if is_new:
-                    path.touch(exist_ok=False)  # another process may have written it meanwhile
-                elif path.exists():
-                    shutil.copymode(path, temporary)
-                temporary.replace(path)
+                    _link(temporary, path)
+                else:
+                    if path.exists():
+                        shutil.copymode(path, temporary)
+                    temporary.replace(path)
             finally:
                 temporary.unlink(missing_ok=True)
 
-    @contextmanager
-    def _problems(self) -> Generator[None]:
-        """Converts system errors to errors that name the file."""
-        try:
-            yield
-        except OSError as error:
-            got = f"{self.path}: {error}"
-            raise invalid("csv", "a file that can be written", got) from None
+
+def check_writable(path: Path) -> None:
+    """Creates the folder of a file, and checks that files can be written in it."""
+    temporary = _temporary(path)
+    with _problems(path, "written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch()
+        temporary.unlink()
+
+
+def _link(temporary: Path, path: Path) -> None:
+    """Gives a file a second name. Fails if another process has created a file of this name."""
+    try:
+        os.link(temporary, path)
+    except OSError:  # perhaps the file system has no hard links
+        if os.path.lexists(path):
+            raise
+        temporary.replace(path)
+
+
+@contextmanager
+def _problems(path: Path, done: str) -> Generator[None]:
+    """Converts system errors to errors that name the file."""
+    try:
+        yield
+    except OSError as error:
+        raise invalid("csv", f"a file that can be {done}", f"{path}: {error}") from None
 
 
 def _temporary(path: Path) -> Path:

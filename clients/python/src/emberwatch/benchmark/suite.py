@@ -10,6 +10,7 @@ from typing import Any, Final, cast
 
 from emberwatch.benchmark.evaluation import evaluate
 from emberwatch.benchmark.policies import Policy
+from emberwatch.benchmark.row_file import check_writable
 from emberwatch.benchmark.rows import Row
 from emberwatch.common.arguments import as_integer, repr_of
 from emberwatch.errors import ExistingFileError, InvalidArgumentError, invalid
@@ -54,7 +55,9 @@ def suite(
     if worlds is not None and (as_integer(worlds) or 0) < 1:
         raise invalid("worlds", "at least 1", repr_of(worlds))
     by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
-    sources = list(tasks or by_task or built_in_tasks())
+    sources = list(by_task or built_in_tasks() if tasks is None else tasks)
+    if not sources:
+        raise invalid("tasks", "at least one task", "none")
     chosen = [(source, Task.named(source)) for source in sources]
     names = [task.name for _, task in chosen]
     if len(set(names)) < len(names):
@@ -65,11 +68,12 @@ def suite(
     stem = name.replace("/", "_").replace("+", "_")
     files = {task_name: Path(folder) / task_name / f"{stem}.csv" for task_name in names}
     for file in files.values():
-        if file.exists():
+        if os.path.lexists(file):
             raise ExistingFileError(
                 f"folder: {file} already exists: remove it, choose another name or folder, or "
                 "leave its task out with tasks="
             )
+        check_writable(file)
     return {
         task.name: evaluate(
             cast("Any", policy) if by_task is None else by_task[task.name],
