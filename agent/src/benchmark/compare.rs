@@ -123,11 +123,8 @@ impl Comparison {
 
     /// Returns the worlds that each policy's rows have, in ascending order.
     pub fn worlds(&self, info: &ServerInfo) -> Vec<World> {
-        let world = |seed| World {
-            seed,
-            steps: self.steps,
-            fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
-        };
+        let fingerprint = info.worlds_fingerprint.clone().unwrap_or_default();
+        let world = |seed| (seed, self.steps, fingerprint.clone());
         self.seeds.clone().map(world).collect()
     }
 

@@ -114,10 +114,8 @@ impl WorldRun {
             grid_seen_share: Some(merit.grid_seen_share),
             log_likelihood: (tally.score.n_seen > 0).then(|| tally.score.mean()),
             worlds_fingerprint: info.worlds_fingerprint.clone().unwrap_or_default(),
-            policy_fingerprint: String::new(),
-            training_seconds: None,
-            is_added: false,
             rewards: tally.rewards,
+            ..PolicyRun::default()
         }
     }
 }

@@ -190,7 +190,8 @@ impl CompareCommand {
                 own.all(|own| own.name != policy),
                 "--add: policy {policy:?}: expected a name that no compared policy has"
             );
-            check_worlds(policy, &group.runs, &comparison.worlds(info)).context("--add")?;
+            check_worlds(policy, group.runs.iter().copied(), &comparison.worlds(info))
+                .context("--add")?;
             ensure!(
                 group
                     .runs

@@ -9,8 +9,8 @@ use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
 use crate::benchmark::report::PolicyRun;
 use crate::benchmark::report::common_worlds::{World, check_worlds};
-use crate::benchmark::report::runs_file::{csv_files, file_of, read_runs, write_runs};
-use crate::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
+use crate::benchmark::report::runs_file::{file_of, read_task, write_runs};
+use crate::benchmark::report::suite::{CEILING, FLOOR, render_suite};
 use crate::benchmark::team::Team;
 use crate::client::errors::is_outage;
 use crate::client::launch::OwnServer;
@@ -22,7 +22,6 @@ use emberwatch_learning::beliefs::WorldForm;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::{self, Policy};
-use emberwatch_protocol::Model;
 use emberwatch_protocol::task::Task;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
@@ -84,51 +83,48 @@ impl SuiteCommand {
             None => {}
         }
         // Errors in policies and worlds come before any run.
-        let (mut plans, mut build) = (Vec::new(), String::new());
+        let (mut plans, mut runs) = (Vec::<Plan<'_>>::new(), Vec::new());
         for task in &self.tasks {
-            let plan = self.plan(task, &config, &mut build);
+            let build = plans.first().map(|plan| plan.build.clone());
+            let plan = self.plan(task, &config, build);
             plans.push(plan.with_context(|| format!("task {}", task.name))?);
         }
-        let mut results = Vec::new();
-        for plan in plans {
-            let task = plan.task.name.clone();
-            let runs = self.carry_out(&plan);
-            let runs = runs.with_context(|| format!("task {task}"))?;
-            results.push(TaskRuns { task, runs });
+        for plan in &plans {
+            let own = self.carry_out(plan);
+            runs.extend(own.with_context(|| format!("task {}", plan.task.name))?);
         }
-        write(&render_suite(&results))
+        write(&render_suite(&runs))
     }
 
-    /// Returns the plan for a task, and reads the rows in its folder. The first plan sets `build`.
+    /// Returns the plan for a task, and reads the rows in its folder. `build` is the digest of the programs, if known.
     fn plan<'a>(
         &self,
         task: &'a Task,
         config: &AgentConfig,
-        build: &mut String,
+        build: Option<String>,
     ) -> Result<Plan<'a>> {
-        let all = task.test_seeds.clone();
-        let end = |n| all.end.min(all.start.saturating_add(n));
-        let seeds = all.start..self.worlds.map_or(all.end, end);
-        let (arena, server) = self.open(task, &seeds, 1)?;
-        if build.is_empty() {
-            *build = server.build()?;
+        let mut seeds = task.test_seeds.clone();
+        if let Some(n) = self.worlds {
+            seeds.end = seeds.end.min(seeds.start.saturating_add(n));
         }
+        let (arena, server) = self.open(task, &seeds, 1)?;
         let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
         ensure!(
             task.max_steps <= longest,
             "max_steps: expected at most {longest}, the length of the shortest episode, got {}",
             task.max_steps
         );
-        let policies = self.policies(arena.model())?;
-        let folder = self.out.join(&task.name);
-        make_folder(&folder)?;
-        let files = csv_files(&folder)?;
-        let found = files.iter().map(|file| read_runs(file));
-        let mut found = found.collect::<Result<Vec<_>>>()?.concat();
-        found.retain(|run| seeds.contains(&run.world_seed));
+        let mut policies: Vec<Policy> = Vec::new();
+        let names = self.policies.iter().map(|name| &**name);
+        for name in [FLOOR, CEILING].into_iter().chain(names) {
+            let policy = Policy::named(name, arena.model())?;
+            if !policies.contains(&policy) {
+                policies.push(policy);
+            }
+        }
         let several = task.robots > 1;
         let comparison = Comparison {
-            policies: Vec::new(),
+            policies,
             teams: vec![if several { Team::Joint } else { Team::Alone }],
             seeds,
             steps: task.max_steps,
@@ -137,36 +133,33 @@ impl SuiteCommand {
             learned: Learned::default(),
             first_state_known: false,
         };
+        let folder = self.out.join(&task.name);
+        make_folder(&folder)?;
+        let mut found = read_task(&folder)?;
+        found.retain(|run| comparison.seeds.contains(&run.world_seed));
         Ok(Plan {
+            task,
             worlds: comparison.worlds(arena.info()),
             comparison,
             form: WorldForm::of(arena.model(), arena.shape()),
-            build: build.clone(),
-            task,
-            policies,
+            build: build.map_or_else(|| server.build(), Ok)?,
             folder,
             found,
         })
     }
 
-    /// Returns all policies of the command, each once.
-    fn policies(&self, model: &Model) -> Result<Vec<Policy>> {
-        let names = [FLOOR, CEILING].into_iter();
-        let mut policies: Vec<Policy> = Vec::new();
-        for name in names.chain(self.policies.iter().map(|name| &**name)) {
-            let policy = Policy::named(name, model)?;
-            if !policies.contains(&policy) {
-                policies.push(policy);
+    /// Trains what the policies of a task need, then runs each policy whose rows are missing or outdated. Returns all
+    /// rows, including those of other programs. Warns about policies that cannot run or were measured on other worlds,
+    /// and leaves them out.
+    fn carry_out(&self, plan: &Plan<'_>) -> Result<Vec<PolicyRun>> {
+        let (task, mut runs, mut missing) = (&plan.task.name, Vec::new(), Vec::new());
+        for policy in plan.others() {
+            match plan.rows(policy, "") {
+                Ok(rows) => runs.extend(rows),
+                Err(reason) => tracing::warn!("task {task}: {policy} is left out: {reason:#}"),
             }
         }
-        Ok(policies)
-    }
-
-    /// Trains what the policies of a task need, then runs each policy whose rows are missing or outdated. Returns all
-    /// rows. Warns about policies that cannot run, and leaves them out.
-    fn carry_out(&self, plan: &Plan<'_>) -> Result<Vec<PolicyRun>> {
-        let (task, mut runs, mut missing) = (&plan.task.name, plan.of_others(), Vec::new());
-        for policy in &plan.policies {
+        for policy in &plan.comparison.policies {
             let name = &policy.name;
             let lesson = match self.prepare(plan, policy) {
                 Ok(lesson) => lesson,
@@ -201,6 +194,7 @@ impl SuiteCommand {
             };
             let mut new = run_comparison(&mut arena, &comparison)?.runs;
             for run in &mut new {
+                run.task.clone_from(task);
                 run.training_seconds = lesson.seconds;
                 run.policy_fingerprint.clone_from(&fingerprint);
             }
@@ -217,9 +211,9 @@ impl SuiteCommand {
             "it needs a known model, and recorded worlds have none"
         );
         let file = file_of(&policy.name);
-        let mut others = plan.found.iter().filter(|run| run.policy != policy.name);
+        let mut found = plan.found.iter();
         ensure!(
-            others.all(|run| file_of(&run.policy) != file),
+            found.all(|run| run.policy == policy.name || file_of(&run.policy) != file),
             "{file} has rows of another policy"
         );
         if !policy.needs_checkpoint() {
@@ -234,20 +228,22 @@ impl SuiteCommand {
             folder: folder.join(&plan.task.name),
             task: plan.task,
             policy,
+            config: &plan.comparison.config,
+            steps: self.train_steps,
+            server: &self.server,
         };
         if self.train {
-            trainings.complete(&plan.comparison.config, self.train_steps, &self.server)?;
+            trainings.complete()?;
         }
         trainings.read(&plan.form)
     }
 
     /// Starts a server with a task's worlds, and opens them. Dropping the server stops it.
     fn open(&self, task: &Task, seeds: &Range<u64>, n_worlds: u32) -> Result<(Arena, OwnServer)> {
-        let worlds = n_worlds.min(MAX_BATCH).to_string();
-        let seed = seeds.start.to_string();
-        let task = ["--task", &task.source, "--worlds", &worlds];
-        let flags = [&task[..], &["--seed", &seed, "--publish-truth"]].concat();
-        let flags: Vec<String> = flags.into_iter().map(String::from).collect();
+        let (worlds, seed) = (n_worlds.min(MAX_BATCH).to_string(), seeds.start.to_string());
+        let task = ["--task", &task.source, "--worlds", &worlds, "--seed", &seed];
+        let mut flags: Vec<String> = task.map(String::from).into();
+        flags.push("--publish-truth".into());
         let server = OwnServer::start(self.server.clone(), &flags)?;
         Ok((Arena::open(server.instance(), n_worlds)?, server))
     }
@@ -256,9 +252,8 @@ impl SuiteCommand {
 /// The policies and worlds of one task of a suite, and the rows that its folder had at the start.
 struct Plan<'a> {
     task: &'a Task,
-    policies: Vec<Policy>,
     worlds: Vec<World>,
-    /// The comparison, without policies and checkpoints.
+    /// The comparison of all policies, without checkpoints.
     comparison: Comparison,
     form: WorldForm,
     /// Digest of the programs.
@@ -274,14 +269,29 @@ impl Plan<'_> {
         let Comparison { teams, config, .. } = &self.comparison;
         let config = toml::to_string(config).expect("invariant: settings serialise");
         let text = format!("{}\n{config}\n{teams:?}\n{learned:?}", self.build);
-        let hash = Sha256::digest(text);
-        hash[..8].iter().map(|byte| format!("{byte:02x}")).collect()
+        format!("{:x}", Sha256::digest(text))[..16].into()
+    }
+
+    /// Returns the policies of other programs, whose rows have no fingerprint.
+    fn others(&self) -> BTreeSet<&str> {
+        let own: Vec<&str> = self
+            .comparison
+            .policies
+            .iter()
+            .map(|it| &*it.name)
+            .collect();
+        let others = self
+            .found
+            .iter()
+            .filter(|run| run.policy_fingerprint.is_empty());
+        let others = others.map(|run| &*run.policy);
+        others.filter(|name| !own.contains(name)).collect()
     }
 
     /// Returns the rows of a policy that were found, if they are from this task's worlds and have this fingerprint.
     fn rows(&self, policy: &str, fingerprint: &str) -> Result<Vec<PolicyRun>> {
         let found = self.found.iter().filter(|run| run.policy == policy);
-        let found: Vec<&PolicyRun> = found.collect();
+        let found: Vec<PolicyRun> = found.cloned().collect();
         check_worlds(policy, &found, &self.worlds)?;
         ensure!(
             found
@@ -289,27 +299,6 @@ impl Plan<'_> {
                 .all(|run| run.policy_fingerprint == fingerprint),
             "its rows are from another build, checkpoint or settings"
         );
-        Ok(found.into_iter().cloned().collect())
-    }
-
-    /// Returns the rows of other programs' policies, which have no fingerprint. Warns about policies that were measured
-    /// on other worlds, and leaves them out.
-    fn of_others(&self) -> Vec<PolicyRun> {
-        let others = self.found.iter().filter(|run| {
-            let is_own = |policy: &Policy| policy.name == run.policy;
-            run.policy_fingerprint.is_empty() && !self.policies.iter().any(is_own)
-        });
-        let others: BTreeSet<&str> = others.map(|run| &*run.policy).collect();
-        let mut runs = Vec::new();
-        for policy in others {
-            match self.rows(policy, "") {
-                Ok(rows) => runs.extend(rows),
-                Err(reason) => {
-                    let task = &self.task.name;
-                    tracing::warn!("task {task}: {policy} is left out: {reason:#}");
-                }
-            }
-        }
-        runs
+        Ok(found)
     }
 }

@@ -27,6 +27,10 @@ pub struct Trainings<'a> {
     pub folder: PathBuf,
     pub task: &'a Task,
     pub policy: &'a Policy,
+    pub config: &'a AgentConfig,
+    /// World steps of each training, summed over its worlds; `None`: the number in the settings.
+    pub steps: Option<u64>,
+    pub server: &'a Option<PathBuf>,
 }
 
 /// What a policy's trainings left.
@@ -43,32 +47,24 @@ impl Trainings<'_> {
     /// If a checkpoint is missing or cannot be used, or if decisions were not learned on the belief next to them.
     pub fn read(&self, world: &WorldForm) -> Result<Lesson> {
         let folders: Vec<PathBuf> = self.folders().map(|(_, folder)| folder).collect();
-        let seconds = folders.iter().map(|folder| seconds::read(folder));
-        let seconds = seconds.collect::<Result<Vec<_>>>()?;
         let learned = read(&folders)?;
         building::check(self.policy, &learned, world)?;
-        let seconds = seconds.into_iter().sum();
+        let seconds = folders.iter().map(|folder| seconds::read(folder));
+        let seconds = seconds.collect::<Result<Vec<_>>>()?.into_iter().sum();
         Ok(Lesson { learned, seconds })
     }
 
-    /// Runs the trainings that have no checkpoint. `steps`: world steps of each, summed over its worlds; `None`: the
-    /// number in the settings.
+    /// Runs the trainings that have no checkpoint.
     ///
     /// # Errors
     /// If a learner cannot learn in the task's worlds.
-    pub fn complete(
-        &self,
-        config: &AgentConfig,
-        steps: Option<u64>,
-        server: &Option<PathBuf>,
-    ) -> Result<()> {
+    pub fn complete(&self) -> Result<()> {
         let mut before = Vec::new();
         for (learner, folder) in self.folders() {
             if !folder.join(CHECKPOINT).exists() {
                 let (task, policy) = (&self.task.name, &self.policy.name);
                 tracing::info!("task {task}: training {learner} for {policy}");
-                let spec = self.spec(learner, config, steps, read(&before)?)?;
-                let trained = self.train(spec, &folder, server.clone());
+                let trained = self.train(learner, read(&before)?, &folder);
                 trained.with_context(|| format!("train --learner {learner}"))?;
             }
             before.push(folder);
@@ -87,20 +83,15 @@ impl Trainings<'_> {
         by.into_iter().chain(decisions)
     }
 
-    fn spec(
-        &self,
-        learner: &str,
-        config: &AgentConfig,
-        steps: Option<u64>,
-        learned: Learned,
-    ) -> Result<TrainingSpec> {
-        let mut config = config.clone();
+    /// Trains in a temporary folder, and renames it when the training is complete.
+    fn train(&self, learner: &str, learned: Learned, folder: &Path) -> Result<()> {
+        let mut config = self.config.clone();
         config.learner = learner.into();
         if learner == DECISIONS.name {
             config.decisions.estimator = self.policy.belief.label.into();
         }
         let kind = learners::named(learner).map_err(anyhow::Error::msg)?;
-        let steps = steps.unwrap_or(match (kind.steps)(&config) {
+        let steps = self.steps.unwrap_or(match (kind.steps)(&config) {
             0 if *kind == FILTER => config.decisions.filter_steps,
             steps => steps,
         });
@@ -108,7 +99,7 @@ impl Trainings<'_> {
             steps > 0,
             "--train-steps: expected a number of steps, as the {learner} has no default length"
         );
-        Ok(TrainingSpec {
+        let spec = TrainingSpec {
             worlds: 0..if kind.is_single { 1 } else { N_WORLDS },
             takeover: false,
             steps,
@@ -119,19 +110,24 @@ impl Trainings<'_> {
             device: Device::Cpu,
             config,
             learned,
-        })
-    }
-
-    /// Trains in a temporary folder, and renames it when the training is complete.
-    fn train(&self, spec: TrainingSpec, folder: &Path, server: Option<PathBuf>) -> Result<()> {
+        };
         for old in [&*spec.out, folder].into_iter().filter(|old| old.exists()) {
             remove_dir_all(old).with_context(|| format!("remove {}", old.display()))?;
         }
         make_folder(&spec.out)?;
-        let worlds = spec.worlds.len().to_string();
-        let (task, seed) = (&self.task.source, FIRST_TRAINING_SEED.to_string());
-        let flags = ["--task", task, "--worlds", &worlds, "--seed", &seed];
-        let server = start_server(server, flags.map(String::from).into(), &spec)?;
+        let (worlds, seed) = (
+            spec.worlds.len().to_string(),
+            FIRST_TRAINING_SEED.to_string(),
+        );
+        let flags = [
+            "--task",
+            &self.task.source,
+            "--worlds",
+            &worlds,
+            "--seed",
+            &seed,
+        ];
+        let server = start_server(self.server.clone(), flags.map(String::from).into(), &spec)?;
         learn(server.instance(), &spec, None, &AtomicBool::new(false))?;
         rename(&spec.out, folder).with_context(|| format!("rename to {}", folder.display()))
     }

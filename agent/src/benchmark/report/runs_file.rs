@@ -49,6 +49,34 @@ pub fn read_runs(path: &Path) -> Result<Vec<PolicyRun>> {
     read().with_context(|| format!("{}: {expected}", path.display()))
 }
 
+/// Reads the runs of all policies on a task, from the CSV files in its folder, which has the task's name.
+pub fn read_task(folder: &Path) -> Result<Vec<PolicyRun>> {
+    let files = csv_files(folder)?;
+    let runs = files.iter().map(|file| read_task_file(file));
+    Ok(runs.collect::<Result<Vec<_>>>()?.concat())
+}
+
+/// Reads a policy's runs on all tasks, which have a folder each.
+pub fn read_policy(folder: &Path, policy: &str) -> Result<Vec<PolicyRun>> {
+    let tasks = std::fs::read_dir(folder)?.map(|task| Ok(task?.path().join(file_of(policy))));
+    let mut files = tasks.collect::<Result<BTreeSet<_>>>()?;
+    files.retain(|file| file.is_file());
+    let runs = files.iter().map(|file| read_task_file(file));
+    let mut runs = runs.collect::<Result<Vec<_>>>()?.concat();
+    runs.retain(|run| run.policy == policy);
+    ensure!(!runs.is_empty(), "expected results of {policy:?}, got none");
+    Ok(runs)
+}
+
+fn read_task_file(path: &Path) -> Result<Vec<PolicyRun>> {
+    let mut runs = read_runs(path)?;
+    let task = path.parent().and_then(Path::file_name).unwrap_or_default();
+    for run in &mut runs {
+        run.task = task.display().to_string();
+    }
+    Ok(runs)
+}
+
 /// Lists the CSV files of a folder, ordered by name.
 pub fn csv_files(folder: &Path) -> Result<BTreeSet<PathBuf>> {
     let entries = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.path()));
@@ -59,7 +87,12 @@ pub fn csv_files(folder: &Path) -> Result<BTreeSet<PathBuf>> {
 
 /// Returns the name of a policy's file. The `/` and `+` of BELIEF/PLANNER/GOAL become `_`.
 pub fn file_of(policy: &str) -> String {
-    format!("{}.csv", policy.replace(['/', '+'], "_"))
+    format!("{}.csv", file_stem(policy))
+}
+
+/// Returns [`file_of`] without its ending.
+pub fn file_stem(policy: &str) -> String {
+    policy.replace(['/', '+'], "_")
 }
 
 /// Returns the file behind a symbolic link, which is replaced instead of the link.
