@@ -350,7 +350,8 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
 /// Runs a comparison with a progress bar.
 pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
-    let n_steps = comparison.n_contestants() as u64 * n_seeds * comparison.steps;
+    let n_contestants = comparison.contestants(arena.model()).len() as u64;
+    let n_steps = n_contestants * n_seeds * comparison.steps;
     let bar = progress_bar(n_steps);
     let results = compare(arena, comparison, &|policy, steps| {
         if bar.message() != policy {
