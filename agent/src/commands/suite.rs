@@ -73,14 +73,13 @@ impl SuiteCommand {
         let mut names = self.policies.iter();
         names.try_for_each(|name| policy::check_name(name))?;
         let config = self.settings.effective()?;
-        match &self.checkpoints {
-            Some(folder) if self.train => make_folder(folder)?,
-            Some(folder) => ensure!(
-                folder.is_dir(),
+        if let Some(folder) = &self.checkpoints {
+            ensure!(
+                self.train || folder.is_dir(),
                 "--checkpoints: expected a folder, got {}",
                 folder.display()
-            ),
-            None => {}
+            );
+            make_folder(folder)?;
         }
         // Errors in policies and worlds come before any run.
         let (mut plans, mut runs) = (Vec::<Plan<'_>>::new(), Vec::new());
@@ -211,9 +210,9 @@ impl SuiteCommand {
             "it needs a known model, and recorded worlds have none"
         );
         let file = file_of(&policy.name);
-        let mut found = plan.found.iter();
+        let is_other = |run: &PolicyRun| run.policy != policy.name && file_of(&run.policy) == file;
         ensure!(
-            found.all(|run| run.policy == policy.name || file_of(&run.policy) != file),
+            !plan.found.iter().any(is_other),
             "{file} has rows of another policy"
         );
         if !policy.needs_checkpoint() {

@@ -5,6 +5,9 @@ use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 
+/// What a column shows of each run.
+type Value<'a> = &'a dyn Fn(&PolicyRun) -> Option<f64>;
+
 /// A table with one row per group, built column by column.
 pub(super) struct Columns<'a> {
     groups: &'a [Group<'a>],
@@ -40,36 +43,21 @@ impl<'a> Columns<'a> {
     }
 
     /// Adds a column of means over worlds.
-    pub(super) fn add_mean(
-        &mut self,
-        heading: &str,
-        decimals: usize,
-        value: impl Fn(&PolicyRun) -> Option<f64>,
-    ) {
-        self.add(heading, |group| match group.estimate(&value) {
+    pub(super) fn add_mean(&mut self, heading: &str, decimals: usize, value: Value<'_>) {
+        self.add(heading, |group| match group.estimate(value) {
             Some(estimate) => number(estimate.mean, decimals),
             None => NOTHING.into(),
         });
     }
 
     /// Adds a column of means over worlds with standard errors.
-    pub(super) fn add_estimate(
-        &mut self,
-        heading: &str,
-        decimals: usize,
-        value: impl Fn(&PolicyRun) -> Option<f64>,
-    ) {
-        self.add(heading, |it| with_error(it.estimate(&value), decimals));
+    pub(super) fn add_estimate(&mut self, heading: &str, decimals: usize, value: Value<'_>) {
+        self.add(heading, |it| with_error(it.estimate(value), decimals));
     }
 
     /// Adds a column of differences from the baseline policy with the same number of robots in team `alone`. The
     /// differences are paired by world.
-    pub(super) fn add_difference(
-        &mut self,
-        baseline: &str,
-        decimals: usize,
-        value: impl Fn(&PolicyRun) -> Option<f64>,
-    ) {
+    pub(super) fn add_difference(&mut self, baseline: &str, decimals: usize, value: Value<'_>) {
         let groups = self.groups;
         self.add("difference", |group| {
             let wanted = (baseline, group.robots, ALONE);
@@ -78,7 +66,7 @@ impl<'a> Columns<'a> {
                 _ if is_baseline(group) => "baseline".into(),
                 None => NOTHING.into(),
                 Some(base) => {
-                    let (values, base) = (group.by_seed(&value), base.by_seed(&value));
+                    let (values, base) = (group.by_seed(value), base.by_seed(value));
                     signed(Estimate::of_difference(&values, &base), decimals)
                 }
             }

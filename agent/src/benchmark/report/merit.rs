@@ -25,16 +25,16 @@ pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String
     let mut columns = Columns::new(groups);
     columns.add("policy", |group| group.name(groups));
     columns.add("detected", detected);
-    columns.add_estimate("after steps", 1, |run| {
+    columns.add_estimate("after steps", 1, &|run| {
         run.steps_to_detection.map(|steps| steps as f64)
     });
-    columns.add_estimate("burning then", 1, |run| {
+    columns.add_estimate("burning then", 1, &|run| {
         run.burning_cells_at_detection.map(f64::from)
     });
-    columns.add_estimate("burning seen %", 1, burning_seen);
-    columns.add_difference(baseline, 1, burning_seen);
-    columns.add_estimate("front", 1, |run| run.front_distance);
-    columns.add_estimate("grid seen %", 1, |run| run.grid_seen_share.map(percent));
+    columns.add_estimate("burning seen %", 1, &burning_seen);
+    columns.add_difference(baseline, 1, &burning_seen);
+    columns.add_estimate("front", 1, &|run| run.front_distance);
+    columns.add_estimate("grid seen %", 1, &|run| run.grid_seen_share.map(percent));
     Some(format!("{heading}\n{}", columns.table()))
 }
 
