@@ -22,16 +22,16 @@ const LEASE: Duration = Duration::from_secs(3600);
 
 /// Worlds of one server, leased for a comparison.
 pub struct Arena {
-    instance: Instance,
+    pub instance: Instance,
     client: Client,
     /// `None` if the server does not publish hidden states.
     truth: Option<TruthFeed>,
     /// The worlds' model. For recorded worlds, a model whose states never change.
-    model: Model,
+    pub model: Model,
     /// The model with which beliefs predict recorded worlds, if one was given.
     known: Option<Model>,
     /// Number of worlds, which is the number of seeds that run at a time.
-    n_worlds: u32,
+    pub n_worlds: u32,
     /// Number of robots per agent: one, or all robots of a world.
     crew: usize,
     /// Seeds of the running worlds.
@@ -82,14 +82,6 @@ impl Arena {
         })
     }
 
-    pub fn instance(&self) -> &Instance {
-        &self.instance
-    }
-
-    pub fn model(&self) -> &Model {
-        &self.model
-    }
-
     /// Returns the model with which beliefs predict.
     pub fn known_model(&self) -> &Model {
         self.known.as_ref().unwrap_or(&self.model)
@@ -122,18 +114,16 @@ impl Arena {
         self.truth.is_some()
     }
 
-    /// Returns the number of seeds that run at a time.
-    pub fn batch_size(&self) -> usize {
-        self.n_worlds as usize
-    }
-
     pub fn n_robots(&self) -> usize {
         self.info().n_robots as usize
     }
 
     /// Sets the kind of team for the following flights.
     pub fn fly_as(&mut self, team: Team) {
-        self.crew = if team.is_joint() { self.n_robots() } else { 1 };
+        self.crew = match team {
+            Team::Joint | Team::Oracle => self.n_robots(),
+            Team::Alone | Team::Shared => 1,
+        };
         // With one robot per world, sharing frames changes nothing.
         self.client.share_frames(team != Team::Alone);
     }

@@ -64,8 +64,8 @@ pub fn compare(
     let prior = first_belief(prior, arena.known_model(), arena.shape(), config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     let mut results = Results::default();
-    let mut feed = Feed::open(arena.instance(), prior.probabilities());
-    let contestants = comparison.contestants(arena.model());
+    let mut feed = Feed::open(&arena.instance, prior.probabilities());
+    let contestants = comparison.contestants(&arena.model);
     // Before other policies run for hours, refuse any policy that cannot run.
     for (policy, _) in &contestants {
         let checked = comparison.check(policy, arena);
@@ -73,7 +73,7 @@ pub fn compare(
     }
     for (index, (policy, team)) in contestants.iter().enumerate() {
         arena.fly_as(*team);
-        for batch in seeds.chunks(arena.batch_size()) {
+        for batch in seeds.chunks(arena.n_worlds as usize) {
             let started = comparison.start(policy, &prior, arena, batch, &mut feed);
             let played = started.and_then(|mut players| {
                 for _ in 0..comparison.steps {
@@ -124,7 +124,7 @@ impl Comparison {
             "it needs the truth channel: start the server with --publish-truth"
         );
         arena.check_model(policy)?;
-        let world = WorldForm::of(arena.model(), arena.shape());
+        let world = WorldForm::of(&arena.model, arena.shape());
         building::check(policy, &self.learned, &world)
     }
 
@@ -158,7 +158,7 @@ impl Comparison {
             let agent = building::agent(policy, &self.config, &conditions, n_moves, seed)?;
             rollouts.push(Rollout::begun(agent, seen)?);
         }
-        let (target, n_robots) = (arena.model().target_state(), arena.n_robots());
+        let (target, n_robots) = (arena.model.target_state(), arena.n_robots());
         let world = |&seed| WorldRun::new(seed, arena.shape(), target, self.recent_steps);
         Ok(Players {
             rollouts,

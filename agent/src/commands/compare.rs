@@ -112,7 +112,7 @@ impl CompareCommand {
             let arena = &mut worlds.arena;
             let dashboard = self
                 .watch
-                .map(|address| OwnDashboard::start(arena.instance(), address))
+                .map(|address| OwnDashboard::start(&arena.instance, address))
                 .transpose()?;
             if let Some(dashboard) = &dashboard {
                 tracing::info!("watch at {}", dashboard.url());
@@ -130,8 +130,8 @@ impl CompareCommand {
             self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
             let policies = &comparison.policies;
-            report.baseline = self.baseline(arena.model(), arena.lacks_model(), policies)?;
-            report.add(axis_label(arena.model()), results);
+            report.baseline = self.baseline(&arena.model, arena.lacks_model(), policies)?;
+            report.add(axis_label(&arena.model), results);
         }
         self.write_results(&report, added, &config)
     }
@@ -213,7 +213,7 @@ impl CompareCommand {
     /// Returns the policies to run in an arena. If the arena has no model, the ladder keeps only policies that need
     /// none.
     fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
-        let mut policies = self.policies(arena.model(), learned)?;
+        let mut policies = self.policies(&arena.model, learned)?;
         if arena.lacks_model() && self.policies.is_empty() && !self.has_teams() {
             policies.retain(|policy| !policy.belief.knows_model);
         }
@@ -350,7 +350,7 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
 /// Runs a comparison with a progress bar.
 pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
-    let n_contestants = comparison.contestants(arena.model()).len() as u64;
+    let n_contestants = comparison.contestants(&arena.model).len() as u64;
     let n_steps = n_contestants * n_seeds * comparison.steps;
     let bar = progress_bar(n_steps);
     let results = compare(arena, comparison, &|policy, steps| {

@@ -5,7 +5,7 @@ use crate::benchmark::report::leaderboard::{
     About, Entry, all_runs, check_entries, read_entries, render_page,
 };
 use crate::benchmark::report::leaderboard_chart::draw_leaderboard;
-use crate::benchmark::report::runs_file::{file_of, read_policy};
+use crate::benchmark::report::runs_file::{file_of, read_tasks};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_learning::file::{Readers, replace_file};
@@ -51,18 +51,26 @@ impl LeaderboardCommand {
     }
 
     fn add(&self, folder: &Path) -> Result<()> {
-        let runs = read_policy(folder, &self.about.policy);
-        let runs = runs.with_context(|| format!("--add {}", folder.display()))?;
+        let flag = || format!("--add {}", folder.display());
+        let file = file_of(&self.about.policy);
+        let tasks = std::fs::read_dir(folder).with_context(flag)?;
+        let files = tasks.map(|task| Ok(task?.path().join(&file)));
         let mut entry = Entry {
             about: self.about.clone(),
-            runs,
+            runs: read_tasks(files.collect::<Result<_>>()?)?,
         };
+        let policy = &entry.about.policy;
+        entry.runs.retain(|run| run.policy == *policy);
+        ensure!(
+            !entry.runs.is_empty(),
+            "{}: expected results of {policy:?}, got none",
+            flag()
+        );
         entry.adopt_training_seconds();
         entry.check()?;
         let mut entries = read_entries(&self.entries)?;
         let policy = &entry.about.policy;
         entries.retain(|other| other.about.policy != *policy);
-        let file = file_of(policy);
         let mut others = entries.iter();
         ensure!(
             others.all(|other| file_of(&other.about.policy) != file),

@@ -9,7 +9,7 @@ use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
 use crate::benchmark::report::PolicyRun;
 use crate::benchmark::report::common_worlds::{World, check_worlds};
-use crate::benchmark::report::runs_file::{file_of, read_task, write_runs};
+use crate::benchmark::report::runs_file::{csv_files, file_of, read_tasks, write_runs};
 use crate::benchmark::report::suite::{CEILING, FLOOR, render_suite};
 use crate::benchmark::team::Team;
 use crate::client::errors::is_outage;
@@ -116,7 +116,7 @@ impl SuiteCommand {
         let mut policies: Vec<Policy> = Vec::new();
         let names = self.policies.iter().map(|name| &**name);
         for name in [FLOOR, CEILING].into_iter().chain(names) {
-            let policy = Policy::named(name, arena.model())?;
+            let policy = Policy::named(name, &arena.model)?;
             if !policies.contains(&policy) {
                 policies.push(policy);
             }
@@ -134,13 +134,13 @@ impl SuiteCommand {
         };
         let folder = self.out.join(&task.name);
         make_folder(&folder)?;
-        let mut found = read_task(&folder)?;
+        let mut found = read_tasks(csv_files(&folder)?)?;
         found.retain(|run| comparison.seeds.contains(&run.world_seed));
         Ok(Plan {
             task,
             worlds: comparison.worlds(arena.info()),
             comparison,
-            form: WorldForm::of(arena.model(), arena.shape()),
+            form: WorldForm::of(&arena.model, arena.shape()),
             build: build.map_or_else(|| server.build(), Ok)?,
             folder,
             found,
@@ -168,7 +168,7 @@ impl SuiteCommand {
                     continue;
                 }
             };
-            let fingerprint = plan.fingerprint(policy, &lesson.learned);
+            let fingerprint = plan.fingerprint(&lesson.learned);
             match plan.rows(name, &fingerprint) {
                 Ok(rows) => {
                     tracing::info!("task {task}: {} rows of {name} kept", rows.len());
@@ -215,14 +215,11 @@ impl SuiteCommand {
             !plan.found.iter().any(is_other),
             "{file} has rows of another policy"
         );
-        if !policy.needs_checkpoint() {
-            return Ok(Lesson {
-                learned: Learned::default(),
-                seconds: Some(0.0),
-            });
-        }
-        let folder = self.checkpoints.as_ref();
-        let folder = folder.context("it needs a checkpoint: add --checkpoints FOLDER")?;
+        ensure!(
+            self.checkpoints.is_some() || !policy.needs_checkpoint(),
+            "it needs a checkpoint: add --checkpoints FOLDER"
+        );
+        let folder = self.checkpoints.clone().unwrap_or_default();
         let trainings = Trainings {
             folder: folder.join(&plan.task.name),
             task: plan.task,
@@ -263,11 +260,11 @@ struct Plan<'a> {
 
 impl Plan<'_> {
     /// Returns 16 hexadecimal digits that identify all that a policy's actions depend on, except its name and worlds.
-    fn fingerprint(&self, policy: &Policy, learned: &Learned) -> String {
-        let learned = policy.needs_checkpoint().then_some(&learned.digests);
+    fn fingerprint(&self, learned: &Learned) -> String {
         let Comparison { teams, config, .. } = &self.comparison;
         let config = toml::to_string(config).expect("invariant: settings serialise");
-        let text = format!("{}\n{config}\n{teams:?}\n{learned:?}", self.build);
+        let (build, learned) = (&self.build, &learned.digests);
+        let text = format!("{build}\n{config}\n{teams:?}\n{learned:?}");
         format!("{:x}", Sha256::digest(text))[..16].into()
     }
 

@@ -91,17 +91,7 @@ const HOSTILE: &str = "</text><script>&amp;\u{1}\"'";
 #[test]
 fn unusual_values_and_names_are_drawn_or_omitted() {
     let long = || "a very long name ".repeat(40);
-    for value in [
-        f64::NAN,
-        f64::INFINITY,
-        f64::MAX,
-        f64::MIN_POSITIVE,
-        -1e150,
-        -1e99,
-        2e-99,
-        1e6,
-        0.0,
-    ] {
+    for value in [f64::NAN, f64::INFINITY, f64::MAX, -1e99, 2e-99, 0.0] {
         let bar = |name: &str| Bar {
             name: name.into(),
             remark: long(),

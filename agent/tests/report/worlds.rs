@@ -1,6 +1,7 @@
 //! Tests of the checks that runs are comparable, and that leaderboard entries contain only plain text.
 
 use super::synthetic::run;
+use emberwatch_agent::benchmark::report::PolicyRun;
 use emberwatch_agent::benchmark::report::common_worlds::{check_worlds, worlds};
 use emberwatch_agent::benchmark::report::leaderboard::Entry;
 
@@ -8,9 +9,11 @@ use emberwatch_agent::benchmark::report::leaderboard::Entry;
 fn a_policy_has_one_run_for_each_world() {
     let runs = [0, 1, 2].map(|seed| run("mine", "none", seed, 1.0));
     let expected = worlds(&runs);
-    let check = |runs| check_worlds("mine", runs, &expected).map_err(|error| error.to_string());
+    let check = |runs: Vec<&PolicyRun>| {
+        check_worlds("mine", runs, &expected).map_err(|error| error.to_string())
+    };
     let [first, second, third] = &runs;
-    assert_eq!(check([third, first, second].to_vec()), Ok(()));
+    assert_eq!(check(vec![third, first, second]), Ok(()));
     let [mut longer, mut elsewhere] = [second.clone(), first.clone()];
     longer.steps = 5;
     elsewhere.worlds_fingerprint.clear();

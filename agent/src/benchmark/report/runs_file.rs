@@ -49,32 +49,19 @@ pub fn read_runs(path: &Path) -> Result<Vec<PolicyRun>> {
     read().with_context(|| format!("{}: {expected}", path.display()))
 }
 
-/// Reads the runs of all policies on a task, from the CSV files in its folder, which has the task's name.
-pub fn read_task(folder: &Path) -> Result<Vec<PolicyRun>> {
-    let files = csv_files(folder)?;
-    let runs = files.iter().map(|file| read_task_file(file));
-    Ok(runs.collect::<Result<Vec<_>>>()?.concat())
-}
-
-/// Reads a policy's runs on all tasks, which have a folder each.
-pub fn read_policy(folder: &Path, policy: &str) -> Result<Vec<PolicyRun>> {
-    let tasks = std::fs::read_dir(folder)?.map(|task| Ok(task?.path().join(file_of(policy))));
-    let mut files = tasks.collect::<Result<BTreeSet<_>>>()?;
-    files.retain(|file| file.is_file());
-    let runs = files.iter().map(|file| read_task_file(file));
-    let mut runs = runs.collect::<Result<Vec<_>>>()?.concat();
-    runs.retain(|run| run.policy == policy);
-    ensure!(!runs.is_empty(), "expected results of {policy:?}, got none");
-    Ok(runs)
-}
-
-fn read_task_file(path: &Path) -> Result<Vec<PolicyRun>> {
-    let mut runs = read_runs(path)?;
-    let task = path.parent().and_then(Path::file_name).unwrap_or_default();
-    for run in &mut runs {
-        run.task = task.display().to_string();
+/// Reads the runs of files whose folders have the names of the runs' tasks. Skips files that do not exist.
+pub fn read_tasks(files: BTreeSet<PathBuf>) -> Result<Vec<PolicyRun>> {
+    let mut all = Vec::new();
+    for file in files.iter().filter(|file| file.is_file()) {
+        let folder = file.parent().and_then(Path::file_name).unwrap_or_default();
+        let task = folder.display().to_string();
+        let runs = read_runs(file)?.into_iter();
+        all.extend(runs.map(|run| PolicyRun {
+            task: task.clone(),
+            ..run
+        }));
     }
-    Ok(runs)
+    Ok(all)
 }
 
 /// Lists the CSV files of a folder, ordered by name.

@@ -35,12 +35,7 @@ const BRIER: &str = "Brier score (lower is better):";
 const N_DRAWS: usize = 10_000;
 
 /// The mean rewards of a policy, the random walk and the oracle in one world.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct WorldRewards {
-    pub floor: f64,
-    pub ceiling: f64,
-    pub policy: f64,
-}
+pub type WorldRewards = [f64; 3];
 
 /// An interquartile mean with the ends of its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -121,13 +116,7 @@ fn rewards(runs: &[PolicyRun], task: &str, policy: &str) -> Vec<WorldRewards> {
         runs.map(|run| (run.world_seed, run.mean_reward)).collect()
     };
     let [floors, ceilings] = [FLOOR, CEILING].map(by_seed);
-    let of_world = |(seed, policy)| {
-        Some(WorldRewards {
-            floor: *floors.get(&seed)?,
-            ceiling: *ceilings.get(&seed)?,
-            policy,
-        })
-    };
+    let of_world = |(seed, reward)| Some([reward, *floors.get(&seed)?, *ceilings.get(&seed)?]);
     by_seed(policy).into_iter().filter_map(of_world).collect()
 }
 
@@ -209,10 +198,9 @@ fn score(tasks: impl Iterator<Item = impl Iterator<Item = WorldRewards>>) -> Opt
 /// Returns each world's score, on a scale from the random walk's mean over the worlds (0) to the oracle's (1). Returns
 /// `None` if the oracle's mean is not the higher one.
 fn scaled(worlds: &[WorldRewards]) -> Option<Vec<f64>> {
-    let n = worlds.len() as f64;
-    let floor = worlds.iter().map(|it| it.floor).sum::<f64>() / n;
-    let ceiling = worlds.iter().map(|it| it.ceiling).sum::<f64>() / n;
-    let score = |it: &WorldRewards| (it.policy - floor) / (ceiling - floor);
+    let mean = |index: usize| worlds.iter().map(|it| it[index]).sum::<f64>() / worlds.len() as f64;
+    let (floor, ceiling) = (mean(1), mean(2));
+    let score = |[policy, ..]: &WorldRewards| (policy - floor) / (ceiling - floor);
     (ceiling > floor).then(|| worlds.iter().map(score).collect())
 }
 
@@ -237,12 +225,12 @@ mod tests {
 
     /// Returns worlds in which the policy's rewards equal its scores.
     fn worlds(scores: &[f64]) -> Vec<WorldRewards> {
-        let world = |&policy: &f64| WorldRewards {
-            floor: 0.0,
-            ceiling: 1.0,
-            policy,
-        };
-        scores.iter().map(world).collect()
+        scores.iter().map(|&score| [score, 0.0, 1.0]).collect()
+    }
+
+    fn aggregate(tasks: &[Vec<WorldRewards>]) -> (f64, [f64; 2]) {
+        let Aggregate { mean, interval } = Aggregate::of(tasks).expect("scores");
+        (mean, interval.expect("several worlds"))
     }
 
     #[test]
@@ -252,66 +240,38 @@ mod tests {
             worlds(&[0.57, 0.49, 0.79, 0.48, 0.56, 0.49, 0.81, 0.47]),
             worlds(&[1.09, 1.01, 0.69, 0.91, 0.53, 0.81, 0.86, 1.01]),
         ];
-        let Aggregate { mean, interval } = Aggregate::of(&tasks).expect("scores");
-        let [low, high] = interval.expect("eight worlds");
+        let (mean, [low, high]) = aggregate(&tasks);
         // rliable 1.2: 0.54583333, [0.4775 to 0.4783, 0.6200 to 0.6217] in three runs of 50,000 draws.
         assert!((mean - 0.545_833_333).abs() < 1e-8, "{mean}");
         assert!((low - 0.478).abs() < 0.003, "{low}");
         assert!((high - 0.621).abs() < 0.003, "{high}");
-        assert_eq!(Aggregate::of(&tasks), Aggregate::of(&tasks));
+        assert_eq!(aggregate(&tasks), (mean, [low, high]));
         assert_eq!(Aggregate::of(&[worlds(&[1.0]), vec![]]), None);
         assert_eq!(interquartile_mean(vec![9.0, 1.0, 3.0, 2.0, -7.0]), 2.0);
     }
 
     #[test]
     fn bootstrap_draws_also_resample_both_ends_of_the_scale() {
-        let world = |policy: f64| WorldRewards {
-            floor: policy / 2.0,
-            ceiling: 2.0 * policy,
-            policy,
-        };
+        let world = |reward: f64| [reward, reward / 2.0, 2.0 * reward];
         // All worlds have the same reward ratios, so only the drawn mixture of worlds varies.
-        let equal = [vec![world(1.0), world(1.0), world(1.0), world(1.0)]];
-        let point = Aggregate::of(&equal).expect("scores");
-        assert_eq!(point.interval, Some([point.mean; 2]));
-        let mixed: Vec<_> = (1..=8).map(|reward| world(reward.into())).collect();
-        let exact = |it: &WorldRewards| WorldRewards {
-            floor: 2.25,
-            ceiling: 9.0,
-            ..*it
-        };
-        let width = |worlds: Vec<WorldRewards>| {
-            let score = Aggregate::of(&[worlds]).expect("scores");
-            let [low, high] = score.interval.expect("eight worlds");
+        let (mean, interval) = aggregate(&[vec![world(1.0); 4]]);
+        assert_eq!(interval, [mean; 2]);
+        let width = |world: fn(f64) -> WorldRewards| {
+            let worlds = (1..=8).map(|reward| world(reward.into()));
+            let (_, [low, high]) = aggregate(&[worlds.collect()]);
             high - low
         };
-        let with_exact_ends = width(mixed.iter().map(exact).collect());
-        assert!(width(mixed) < 0.5 * with_exact_ends);
+        assert!(width(world) < 0.5 * width(|reward| [reward, 2.25, 9.0]));
         // Half of the draws of these two worlds have no scale.
-        let reversed = WorldRewards {
-            floor: 1.0,
-            ceiling: 0.0,
-            policy: 0.5,
-        };
-        let score = Aggregate::of(&[vec![world(2.0), reversed]]).expect("scores");
-        let ends = score.interval.expect("two worlds");
+        let (_, ends) = aggregate(&[vec![world(2.0), [0.5, 1.0, 0.0]]]);
         assert!(ends.iter().all(|end| end.is_finite()), "{ends:?}");
     }
 
     #[test]
     fn a_task_of_one_world_leaves_no_interval() {
-        for tasks in [
-            vec![vec![0.5]],
-            vec![vec![0.5], vec![0.5]],
-            vec![vec![0.5], vec![0.4, 0.5, 0.6]],
-        ] {
-            let tasks: Vec<_> = tasks.iter().map(|scores| worlds(scores)).collect();
+        let one = worlds(&[0.5]);
+        for tasks in [vec![one.clone()], vec![one, worlds(&[0.4, 0.5, 0.6])]] {
             let score = Aggregate::of(&tasks).expect("scores");
-            let expected = Aggregate {
-                mean: 0.5,
-                interval: None,
-            };
-            assert_eq!(score, expected, "{tasks:?}");
             assert_eq!(score_text(score), "0.500 (no interval)");
         }
         // Several worlds with equal scores have an interval: a single point.
