@@ -131,7 +131,9 @@ impl CompareCommand {
             let results = run_comparison(arena, &comparison)?;
             let policies = &comparison.policies;
             report.baseline = self.baseline(&arena.model, arena.lacks_model(), policies)?;
-            report.add(axis_label(&arena.model), results);
+            report.axis_label = axis_label(&arena.model);
+            report.fire_cells = results.fire_cells;
+            report.runs.extend(results.runs);
         }
         self.write_results(&report, added, &config)
     }
@@ -299,24 +301,11 @@ struct Report {
     baseline: String,
 }
 
-impl Report {
-    fn add(&mut self, axis_label: String, results: Results) {
-        self.runs.extend(results.runs);
-        self.fire_cells = results.fire_cells;
-        self.axis_label = axis_label;
-    }
-}
-
 fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConfig) -> Result<()> {
     let label = &*report.axis_label;
     draw_ladder(&directory.join("ladder.svg"), all, label)?;
-    let fire_cells = Some(&*report.fire_cells);
-    draw_rewards(
-        &directory.join("rewards.svg"),
-        &report.runs,
-        label,
-        fire_cells,
-    )?;
+    let rewards = directory.join("rewards.svg");
+    draw_rewards(&rewards, &report.runs, label, &report.fire_cells)?;
     draw_teams(&directory.join("teams.svg"), all, label)?;
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");

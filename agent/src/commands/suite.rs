@@ -228,10 +228,7 @@ impl SuiteCommand {
             steps: self.train_steps,
             server: &self.server,
         };
-        if self.train {
-            trainings.complete()?;
-        }
-        trainings.read(&plan.form)
+        trainings.lesson(self.train, &plan.form)
     }
 
     /// Starts a server with a task's worlds, and opens them. Dropping the server stops it.

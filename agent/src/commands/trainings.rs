@@ -41,35 +41,27 @@ pub struct Lesson {
 }
 
 impl Trainings<'_> {
-    /// Reads the checkpoints.
+    /// Reads the checkpoints. If `trains`, first runs the trainings that have none.
     ///
     /// # Errors
-    /// If a checkpoint is missing or cannot be used, or if decisions were not learned on the belief next to them.
-    pub fn read(&self, world: &WorldForm) -> Result<Lesson> {
-        let folders: Vec<PathBuf> = self.folders().map(|(_, folder)| folder).collect();
-        let learned = read(&folders)?;
-        building::check(self.policy, &learned, world)?;
-        let seconds = folders.iter().map(|folder| seconds::read(folder));
-        let seconds = seconds.collect::<Result<Vec<_>>>()?.into_iter().sum();
-        Ok(Lesson { learned, seconds })
-    }
-
-    /// Runs the trainings that have no checkpoint.
-    ///
-    /// # Errors
-    /// If a learner cannot learn in the task's worlds.
-    pub fn complete(&self) -> Result<()> {
-        let mut before = Vec::new();
+    /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, or if a
+    /// learner cannot learn in the task's worlds.
+    pub fn lesson(&self, trains: bool, world: &WorldForm) -> Result<Lesson> {
+        let (mut folders, mut all_seconds) = (Vec::new(), Vec::new());
         for (learner, folder) in self.folders() {
-            if !folder.join(CHECKPOINT).exists() {
+            if trains && !folder.join(CHECKPOINT).exists() {
                 let (task, policy) = (&self.task.name, &self.policy.name);
                 tracing::info!("task {task}: training {learner} for {policy}");
-                let trained = self.train(learner, read(&before)?, &folder);
+                let trained = self.train(learner, read(&folders)?, &folder);
                 trained.with_context(|| format!("train --learner {learner}"))?;
             }
-            before.push(folder);
+            all_seconds.push(seconds::read(&folder)?);
+            folders.push(folder);
         }
-        Ok(())
+        let learned = read(&folders)?;
+        building::check(self.policy, &learned, world)?;
+        let seconds = all_seconds.into_iter().sum();
+        Ok(Lesson { learned, seconds })
     }
 
     /// Returns learner and folder of each training, the belief first.

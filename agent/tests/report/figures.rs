@@ -74,7 +74,7 @@ fn charts_of_results_have_all_names() {
     for (name, n_steps) in [("rewards", 1500), ("rewards_one_step", 1)] {
         let fire: Vec<f32> = (0..n_steps).map(|step| step as f32).collect();
         check(name, &names, |path| {
-            draw_rewards(path, &ladder(2, n_steps), LABEL, Some(&fire))
+            draw_rewards(path, &ladder(2, n_steps), LABEL, &fire)
         });
     }
     check("teams", &["robots", "alone", "joint"], |path| {
@@ -145,7 +145,7 @@ fn results_that_cannot_be_drawn_are_errors() {
     for (drawn, words) in [
         (draw_ladder(&path, &[], LABEL), "ladder: expected at least"),
         (draw_ladder(&path, &nan, LABEL), "\"beam\" on world seed 3"),
-        (draw_rewards(&path, &one, LABEL, None), "expected points"),
+        (draw_rewards(&path, &one, LABEL, &[]), "expected points"),
         (draw_ladder(nowhere, &one, LABEL), "write /nonexist"),
     ] {
         let error = drawn.expect_err(words).to_string();
