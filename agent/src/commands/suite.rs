@@ -74,12 +74,14 @@ impl SuiteCommand {
         names.try_for_each(|name| policy::check_name(name))?;
         let config = self.settings.effective()?;
         if let Some(folder) = &self.checkpoints {
+            if self.train {
+                make_folder(folder)?;
+            }
             ensure!(
-                self.train || folder.is_dir(),
+                folder.is_dir(),
                 "--checkpoints: expected a folder, got {}",
                 folder.display()
             );
-            make_folder(folder)?;
         }
         // Errors in policies and worlds come before any run.
         let (mut plans, mut runs) = (Vec::<Plan<'_>>::new(), Vec::new());
