@@ -47,7 +47,7 @@ impl Trainings<'_> {
     /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, or if a
     /// learner cannot learn in the task's worlds.
     pub fn lesson(&self, trains: bool, world: &WorldForm) -> Result<Lesson> {
-        let (mut folders, mut all_seconds) = (Vec::new(), Vec::new());
+        let (mut folders, mut sum) = (Vec::new(), Some(0.0));
         for (learner, folder) in self.folders() {
             if trains && !folder.join(CHECKPOINT).exists() {
                 let (task, policy) = (&self.task.name, &self.policy.name);
@@ -55,13 +55,15 @@ impl Trainings<'_> {
                 let trained = self.train(learner, read(&folders)?, &folder);
                 trained.with_context(|| format!("train --learner {learner}"))?;
             }
-            all_seconds.push(seconds::read(&folder)?);
+            sum = sum.zip(seconds::read(&folder)?).map(|(sum, own)| sum + own);
             folders.push(folder);
         }
         let learned = read(&folders)?;
         building::check(self.policy, &learned, world)?;
-        let seconds = all_seconds.into_iter().sum();
-        Ok(Lesson { learned, seconds })
+        Ok(Lesson {
+            learned,
+            seconds: sum,
+        })
     }
 
     /// Returns learner and folder of each training, the belief first.
