@@ -25,7 +25,7 @@ pub struct Arena {
     pub instance: Instance,
     client: Client,
     /// `None` if the server does not publish hidden states.
-    truth: Option<TruthFeed>,
+    pub truth: Option<TruthFeed>,
     /// The worlds' model. For recorded worlds, a model whose states never change.
     pub model: Model,
     /// The model with which beliefs predict recorded worlds, if one was given.
@@ -108,10 +108,6 @@ impl Arena {
 
     pub fn info(&self) -> &ServerInfo {
         self.client.info()
-    }
-
-    pub fn shows_truth(&self) -> bool {
-        self.truth.is_some()
     }
 
     pub fn n_robots(&self) -> usize {

@@ -120,7 +120,7 @@ impl Comparison {
     fn check(&self, policy: &Policy, arena: &Arena) -> Result<()> {
         let needs_truth = policy.belief.input == Input::States || self.first_state_known;
         ensure!(
-            arena.shows_truth() || !needs_truth,
+            arena.truth.is_some() || !needs_truth,
             "it needs the truth channel: start the server with --publish-truth"
         );
         arena.check_model(policy)?;

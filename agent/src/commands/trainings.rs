@@ -47,7 +47,7 @@ impl Trainings<'_> {
     /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, or if a
     /// learner cannot learn in the task's worlds.
     pub fn lesson(&self, trains: bool, world: &WorldForm) -> Result<Lesson> {
-        let (mut folders, mut sum) = (Vec::new(), Some(0.0));
+        let (mut folders, mut seconds) = (Vec::new(), Some(0.0));
         for (learner, folder) in self.folders() {
             if trains && !folder.join(CHECKPOINT).exists() {
                 let (task, policy) = (&self.task.name, &self.policy.name);
@@ -55,15 +55,13 @@ impl Trainings<'_> {
                 let trained = self.train(learner, read(&folders)?, &folder);
                 trained.with_context(|| format!("train --learner {learner}"))?;
             }
-            sum = sum.zip(seconds::read(&folder)?).map(|(sum, own)| sum + own);
+            let own = seconds::read(&folder)?;
+            seconds = seconds.zip(own).map(|(sum, own)| sum + own);
             folders.push(folder);
         }
         let learned = read(&folders)?;
         building::check(self.policy, &learned, world)?;
-        Ok(Lesson {
-            learned,
-            seconds: sum,
-        })
+        Ok(Lesson { learned, seconds })
     }
 
     /// Returns learner and folder of each training, the belief first.
