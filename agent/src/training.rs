@@ -113,7 +113,7 @@ impl TrainingLoop {
     ) -> Result<Self> {
         let stopwatch = Stopwatch::start(&spec.out, spec.resume)?;
         if let Some(contents) = &contents
-            && spec.has_other_settings(contents)
+            && contents.settings().map_or(true, |it| it != spec.config)
         {
             tracing::warn!("the settings differ from the checkpoint's, and replace them");
         }

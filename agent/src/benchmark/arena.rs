@@ -5,18 +5,12 @@ use crate::benchmark::team::Team;
 use crate::client::info::connect;
 use crate::client::truth::TruthFeed;
 use anyhow::{Context, Result, ensure};
-use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::planning::team::robot_seed;
-use emberwatch_learning::beliefs::Conditions;
-use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::Policy;
-use emberwatch_learning::rollout::agent::Agent;
-use emberwatch_learning::rollout::{Environment, Seen, building};
+use emberwatch_learning::rollout::{Environment, Seen};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::control::{ServerInfo, WorldSeed};
-use emberwatch_protocol::{Client, Grid, Model, Move, Shape};
+use emberwatch_protocol::{Client, Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
@@ -28,25 +22,27 @@ const LEASE: Duration = Duration::from_secs(3600);
 
 /// Worlds of one server, leased for a comparison.
 pub struct Arena {
-    instance: Instance,
+    pub instance: Instance,
     client: Client,
     /// `None` if the server does not publish hidden states.
-    truth: Option<TruthFeed>,
+    pub truth: Option<TruthFeed>,
     /// The worlds' model. For recorded worlds, a model whose states never change.
-    model: Model,
+    pub model: Model,
     /// The model with which beliefs predict recorded worlds, if one was given.
     known: Option<Model>,
     /// Number of worlds, which is the number of seeds that run at a time.
-    n_worlds: u32,
+    pub n_worlds: u32,
     /// Number of robots per agent: one, or all robots of a world.
     crew: usize,
+    /// Seeds of the running worlds.
+    seeds: Vec<u64>,
+    /// Number of steps since the reset.
+    step: u64,
 }
 
 impl Arena {
     /// Acquires up to `n_seeds` worlds.
     pub fn open(instance: &Instance, n_seeds: u32) -> Result<Self> {
-        let unfit =
-            |needs: &str| format!("instance {:?}: comparing needs {needs}", instance.name());
         let connection = connect(instance)?;
         let (n_worlds, team) = (connection.info().n_worlds, connection.info().n_robots);
         let n_worlds = n_worlds.min(n_seeds).min(MAX_BATCH);
@@ -64,7 +60,10 @@ impl Arena {
             recorded => recorded,
         };
         let model = model.with_context(|| {
-            unfit("the model, for filters: start the server with --reveal-model true")
+            format!(
+                "instance {:?}: comparing needs the model, for filters: start the server with --reveal-model true",
+                instance.name()
+            )
         })?;
         let truth = info
             .publish_truth
@@ -78,15 +77,9 @@ impl Arena {
             known: None,
             n_worlds,
             crew: 1,
+            seeds: Vec::new(),
+            step: 0,
         })
-    }
-
-    pub fn instance(&self) -> &Instance {
-        &self.instance
-    }
-
-    pub fn model(&self) -> &Model {
-        &self.model
     }
 
     /// Returns the model with which beliefs predict.
@@ -117,22 +110,16 @@ impl Arena {
         self.client.info()
     }
 
-    pub fn shows_truth(&self) -> bool {
-        self.truth.is_some()
-    }
-
-    /// Returns the number of seeds that run at a time.
-    pub fn batch_size(&self) -> usize {
-        self.n_worlds as usize
-    }
-
     pub fn n_robots(&self) -> usize {
         self.info().n_robots as usize
     }
 
     /// Sets the kind of team for the following flights.
     pub fn fly_as(&mut self, team: Team) {
-        self.crew = if team.is_joint() { self.n_robots() } else { 1 };
+        self.crew = match team {
+            Team::Joint | Team::Oracle => self.n_robots(),
+            Team::Alone | Team::Shared => 1,
+        };
         // With one robot per world, sharing frames changes nothing.
         self.client.share_frames(team != Team::Alone);
     }
@@ -143,45 +130,15 @@ impl Arena {
 
     /// Starts worlds with these seeds; returns what agents see at k = 0, by world.
     pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>> {
-        let orders = seeds.iter().zip(0..);
-        let orders = orders.map(|(&seed, world)| WorldSeed {
+        (self.seeds, self.step) = (seeds.to_vec(), 0);
+        let order = |(world, &seed)| WorldSeed {
             world,
             seed: Some(seed),
-        });
-        self.client.reset(&orders.collect::<Vec<_>>())?;
-        let truth = self.states(seeds, 0)?;
-        let robots = self.robots(seeds);
-        let observations = self.client.observe(robots)?;
-        Ok(self.seen(observations, &truth))
-    }
-
-    /// Returns the worlds of these seeds as an environment whose next step is `step`.
-    pub fn batch<'a>(&'a mut self, seeds: &'a [u64], step: u64) -> Batch<'a> {
-        Batch {
-            arena: self,
-            seeds,
-            step,
-        }
-    }
-
-    /// Creates a policy's agent for the world of a seed. `number` is the agent's index in the world.
-    pub fn agent(
-        &self,
-        policy: &Policy,
-        config: &AgentConfig,
-        prior: &Belief,
-        (seed, number): (u64, usize),
-        learned: &Learned,
-    ) -> Result<Agent> {
-        self.check_model(policy)?;
-        let conditions = Conditions {
-            model: Some(self.known_model()),
-            shape: self.shape(),
-            prior: Some(prior),
-            learned,
         };
-        let seed = robot_seed(config.planner_seed(seed), number);
-        building::agent(policy, config, &conditions, self.info().n_moves, seed)
+        let orders: Vec<WorldSeed> = (0..).zip(seeds).map(order).collect();
+        self.client.reset(&orders)?;
+        let observations = self.client.observe(self.robots())?;
+        self.seen(observations)
     }
 
     /// Returns an error if the policy's filter needs a model and the worlds have none.
@@ -193,43 +150,30 @@ impl Arena {
         Ok(())
     }
 
-    /// Returns the hidden states of the worlds of these seeds at a step, or `None` for each world if they are not
-    /// published.
-    fn states(&self, seeds: &[u64], step: u64) -> Result<Vec<Option<Grid<u8>>>> {
-        let Some(truth) = &self.truth else {
-            return Ok(vec![None; seeds.len()]);
-        };
-        let states = truth.states(0..seeds.len() as u32, seeds, step)?;
-        Ok(states.into_iter().map(Some).collect())
+    fn robots(&self) -> Range<u32> {
+        0..self.seeds.len() as u32 * self.info().n_robots
     }
 
-    fn robots(&self, seeds: &[u64]) -> Range<u32> {
-        0..seeds.len() as u32 * self.info().n_robots
-    }
-
-    fn seen(&self, observations: Vec<Observation>, truths: &[Option<Grid<u8>>]) -> Vec<Seen> {
+    /// Returns what agents see at the present step, with the hidden states if they are published.
+    fn seen(&self, observations: Vec<Observation>) -> Result<Vec<Seen>> {
+        let n_worlds = self.seeds.len();
+        let truth = self.truth.as_ref();
+        let truth = truth.map(|truth| truth.states(0..n_worlds as u32, &self.seeds, self.step));
+        let truth = truth.transpose()?;
         let mut observations = observations.into_iter();
-        let agents = truths.iter().flat_map(|truth| vec![truth; self.n_agents()]);
-        let seen = agents.map(|truth| Seen {
-            truth: truth.clone(),
+        let agents = (0..n_worlds).flat_map(|world| vec![world; self.n_agents()]);
+        let seen = agents.map(|world| Seen {
+            truth: truth.as_ref().map(|states| states[world].clone()),
             ..Seen::new(observations.by_ref().take(self.crew))
         });
-        seen.collect()
+        Ok(seen.collect())
     }
 }
 
-/// Worlds of an arena as an environment. Observations are ordered by world.
-pub struct Batch<'a> {
-    arena: &'a mut Arena,
-    seeds: &'a [u64],
-    step: u64,
-}
-
-impl Environment for Batch<'_> {
+impl Environment for Arena {
     fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>> {
-        let arena = &mut *self.arena;
-        let observations = arena.client.step(arena.robots(self.seeds), paths)?;
-        let truth = arena.states(self.seeds, self.step)?;
-        Ok(Some(arena.seen(observations, &truth)))
+        self.step += 1;
+        let observations = self.client.step(self.robots(), paths)?;
+        self.seen(observations).map(Some)
     }
 }

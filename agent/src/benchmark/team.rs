@@ -25,9 +25,4 @@ impl Team {
             Self::Oracle => "oracle",
         }
     }
-
-    /// Returns whether one agent flies all robots of a world.
-    pub fn is_joint(self) -> bool {
-        matches!(self, Self::Joint | Self::Oracle)
-    }
 }

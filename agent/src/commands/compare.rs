@@ -112,7 +112,7 @@ impl CompareCommand {
             let arena = &mut worlds.arena;
             let dashboard = self
                 .watch
-                .map(|address| OwnDashboard::start(arena.instance(), address))
+                .map(|address| OwnDashboard::start(&arena.instance, address))
                 .transpose()?;
             if let Some(dashboard) = &dashboard {
                 tracing::info!("watch at {}", dashboard.url());
@@ -130,8 +130,10 @@ impl CompareCommand {
             self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
             let policies = &comparison.policies;
-            report.baseline = self.baseline(arena.model(), arena.lacks_model(), policies)?;
-            report.add(axis_label(arena.model()), results);
+            report.baseline = self.baseline(&arena.model, arena.lacks_model(), policies)?;
+            report.axis_label = axis_label(&arena.model);
+            report.fire_cells = results.fire_cells;
+            report.runs.extend(results.runs);
         }
         self.write_results(&report, added, &config)
     }
@@ -190,7 +192,8 @@ impl CompareCommand {
                 own.all(|own| own.name != policy),
                 "--add: policy {policy:?}: expected a name that no compared policy has"
             );
-            check_worlds(policy, &group.runs, &comparison.worlds(info)).context("--add")?;
+            check_worlds(policy, group.runs.iter().copied(), &comparison.worlds(info))
+                .context("--add")?;
             ensure!(
                 group
                     .runs
@@ -212,7 +215,7 @@ impl CompareCommand {
     /// Returns the policies to run in an arena. If the arena has no model, the ladder keeps only policies that need
     /// none.
     fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
-        let mut policies = self.policies(arena.model(), learned)?;
+        let mut policies = self.policies(&arena.model, learned)?;
         if arena.lacks_model() && self.policies.is_empty() && !self.has_teams() {
             policies.retain(|policy| !policy.belief.knows_model);
         }
@@ -298,24 +301,11 @@ struct Report {
     baseline: String,
 }
 
-impl Report {
-    fn add(&mut self, axis_label: String, results: Results) {
-        self.runs.extend(results.runs);
-        self.fire_cells = results.fire_cells;
-        self.axis_label = axis_label;
-    }
-}
-
 fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConfig) -> Result<()> {
     let label = &*report.axis_label;
     draw_ladder(&directory.join("ladder.svg"), all, label)?;
-    let fire_cells = Some(&*report.fire_cells);
-    draw_rewards(
-        &directory.join("rewards.svg"),
-        &report.runs,
-        label,
-        fire_cells,
-    )?;
+    let rewards = directory.join("rewards.svg");
+    draw_rewards(&rewards, &report.runs, label, &report.fire_cells)?;
     draw_teams(&directory.join("teams.svg"), all, label)?;
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
@@ -349,7 +339,8 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
 /// Runs a comparison with a progress bar.
 pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
-    let n_steps = comparison.n_contestants() as u64 * n_seeds * comparison.steps;
+    let n_contestants = comparison.contestants(&arena.model).len() as u64;
+    let n_steps = n_contestants * n_seeds * comparison.steps;
     let bar = progress_bar(n_steps);
     let results = compare(arena, comparison, &|policy, steps| {
         if bar.message() != policy {

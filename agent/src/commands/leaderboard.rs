@@ -2,11 +2,10 @@
 
 use super::shared::write;
 use crate::benchmark::report::leaderboard::{
-    About, Entry, check_entries, read_entries, render_page,
+    About, Entry, all_runs, check_entries, read_entries, render_page,
 };
 use crate::benchmark::report::leaderboard_chart::draw_leaderboard;
-use crate::benchmark::report::runs_file::{file_of, read_runs};
-use crate::benchmark::report::suite::TaskRuns;
+use crate::benchmark::report::runs_file::{file_of, read_tasks};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_learning::file::{Readers, replace_file};
@@ -28,21 +27,8 @@ pub struct LeaderboardCommand {
     /// Add a policy from this folder of results, written by `suite --out` or `emberwatch.benchmark.suite` in Python
     #[arg(long, value_name = "FOLDER", requires_all = ["policy", "by", "code", "commit"])]
     add: Option<PathBuf>,
-    /// Name of the policy to add
-    #[arg(long, requires = "add")]
-    policy: Option<String>,
-    /// Author of the policy
-    #[arg(long, requires = "add")]
-    by: Option<String>,
-    /// Where to find its code, such as an https:// address
-    #[arg(long, requires = "add")]
-    code: Option<String>,
-    /// Commit of that code: 7 to 40 hexadecimal digits
-    #[arg(long, requires = "add")]
-    commit: Option<String>,
-    /// Processor seconds of training, summed over all tasks [default: from the rows of `suite`]
-    #[arg(long, value_name = "SECONDS", requires = "add")]
-    training_seconds: Option<f64>,
+    #[command(flatten)]
+    about: About,
 }
 
 impl LeaderboardCommand {
@@ -54,73 +40,45 @@ impl LeaderboardCommand {
         let entries = read_entries(&self.entries)?;
         check_entries(&entries)?;
         let table = render_page(&entries);
-        let page =
-            std::fs::read_to_string(&self.page).with_context(|| self.page.display().to_string())?;
-        let (kept, _) = page.split_once(MADE).with_context(|| {
-            format!(
-                "{}: expected a line {MADE} (the text below it is generated), got none",
-                self.page.display()
-            )
+        let page = self.page.display();
+        let text = std::fs::read_to_string(&self.page).with_context(|| page.to_string())?;
+        let (kept, _) = text.split_once(MADE).with_context(|| {
+            format!("{page}: expected a line {MADE} (the text below it is generated), got none")
         })?;
-        let page = format!("{kept}{MADE}\n\n{table}");
-        replace_file(&self.page, page.as_bytes(), Readers::Any)?;
-        draw_leaderboard(&self.page.with_extension("svg"), &entries)?;
+        let text = format!("{kept}{MADE}\n\n{table}");
+        replace_file(&self.page, text.as_bytes(), Readers::Any)?;
+        draw_leaderboard(&self.page.with_extension("svg"), &all_runs(&entries))?;
         write(&table)
     }
 
     fn add(&self, folder: &Path) -> Result<()> {
-        let text = |flag: &Option<String>| flag.clone().unwrap_or_default();
-        let policy = text(&self.policy);
-        let tasks = tasks(folder, &policy)?;
-        ensure!(
-            !tasks.is_empty(),
-            "--add {}: expected results of {policy:?}, got none",
-            folder.display()
-        );
-        let recorded = tasks.iter().map(|task| task.runs[0].training_seconds).sum();
-        let about = About {
-            training_seconds: self.training_seconds.or(recorded).context(
-                "--training-seconds: expected a number, as the rows of a task have none",
-            )?,
-            policy,
-            by: text(&self.by),
-            code: text(&self.code),
-            commit: text(&self.commit),
+        let flag = || format!("--add {}", folder.display());
+        let file = file_of(&self.about.policy);
+        let tasks = std::fs::read_dir(folder).with_context(flag)?;
+        let files = tasks.map(|task| Ok(task?.path().join(&file)));
+        let mut entry = Entry {
+            about: self.about.clone(),
+            runs: read_tasks(files.collect::<Result<BTreeSet<_>>>()?)?,
         };
-        let entry = Entry { about, tasks };
+        let policy = &entry.about.policy;
+        entry.runs.retain(|run| run.policy == *policy);
+        ensure!(
+            !entry.runs.is_empty(),
+            "{}: expected results of {policy:?}, got none",
+            flag()
+        );
+        entry.adopt_training_seconds();
         entry.check()?;
         let mut entries = read_entries(&self.entries)?;
-        entries.retain(|other| other.about.policy != entry.about.policy);
-        let file = file_of(&entry.about.policy);
-        for other in &entries {
-            ensure!(
-                file_of(&other.about.policy) != file,
-                "--policy {}: its file name is taken by the entry of {}: choose another name",
-                entry.about.policy,
-                other.about.policy
-            );
-        }
+        let policy = &entry.about.policy;
+        entries.retain(|other| other.about.policy != *policy);
+        let mut others = entries.iter();
+        ensure!(
+            others.all(|other| file_of(&other.about.policy) != file),
+            "--policy {policy}: its file name is taken by another entry: choose another name"
+        );
         entries.push(entry.clone());
         check_entries(&entries)?;
         entry.write(&self.entries.join(file))
     }
-}
-
-/// Reads a policy's runs in the folder of each task.
-fn tasks(folder: &Path, policy: &str) -> Result<Vec<TaskRuns>> {
-    let folders =
-        std::fs::read_dir(folder).with_context(|| format!("--add {}", folder.display()))?;
-    let folders = folders.map(|entry| Ok(entry?.path()));
-    let mut tasks = Vec::new();
-    for folder in folders.collect::<Result<BTreeSet<_>>>()? {
-        let path = folder.join(file_of(policy));
-        if path.is_file() {
-            let task = folder.file_name().unwrap_or_default().display().to_string();
-            let mut runs = read_runs(&path)?;
-            runs.retain(|run| run.policy == policy);
-            tasks.push(TaskRuns { task, runs });
-        }
-    }
-    tasks.retain(|task| !task.runs.is_empty());
-    Ok(tasks)
 }

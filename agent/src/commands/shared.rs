@@ -36,11 +36,9 @@ pub fn asks_for_help(policies: &[String]) -> bool {
 }
 
 pub fn parse_seconds(text: &str) -> Result<Duration, String> {
-    let seconds: f64 = text
-        .parse()
-        .map_err(|_| "expected a number of seconds, such as 60")?;
-    let limit = Duration::try_from_secs_f64(seconds);
-    limit.map_err(|error| format!("expected a number of seconds, such as 60: {error}"))
+    let limit = text.parse().ok().map(Duration::try_from_secs_f64);
+    let limit = limit.and_then(Result::ok);
+    limit.ok_or("expected a number of seconds, such as 60".into())
 }
 
 /// Parses `FIRST..END`: at least one number, END excluded.

@@ -9,8 +9,8 @@ use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
 use crate::benchmark::report::PolicyRun;
 use crate::benchmark::report::common_worlds::{World, check_worlds};
-use crate::benchmark::report::runs_file::{csv_files, file_of, read_runs, write_runs};
-use crate::benchmark::report::suite::{CEILING, FLOOR, TaskRuns, render_suite};
+use crate::benchmark::report::runs_file::{csv_files, file_of, read_tasks, write_runs};
+use crate::benchmark::report::suite::{CEILING, FLOOR, render_suite};
 use crate::benchmark::team::Team;
 use crate::client::errors::is_outage;
 use crate::client::launch::OwnServer;
@@ -22,7 +22,6 @@ use emberwatch_learning::beliefs::WorldForm;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::{self, Policy};
-use emberwatch_protocol::Model;
 use emberwatch_protocol::task::Task;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
@@ -74,62 +73,59 @@ impl SuiteCommand {
         let mut names = self.policies.iter();
         names.try_for_each(|name| policy::check_name(name))?;
         let config = self.settings.effective()?;
-        match &self.checkpoints {
-            Some(folder) if self.train => make_folder(folder)?,
-            Some(folder) => ensure!(
+        if let Some(folder) = &self.checkpoints {
+            if self.train {
+                make_folder(folder)?;
+            }
+            ensure!(
                 folder.is_dir(),
                 "--checkpoints: expected a folder, got {}",
                 folder.display()
-            ),
-            None => {}
+            );
         }
         // Errors in policies and worlds come before any run.
-        let (mut plans, mut build) = (Vec::new(), String::new());
+        let (mut plans, mut runs) = (Vec::<Plan<'_>>::new(), Vec::new());
         for task in &self.tasks {
-            let plan = self.plan(task, &config, &mut build);
+            let build = plans.first().map(|plan| plan.build.clone());
+            let plan = self.plan(task, &config, build);
             plans.push(plan.with_context(|| format!("task {}", task.name))?);
         }
-        let mut results = Vec::new();
-        for plan in plans {
-            let task = plan.task.name.clone();
-            let runs = self.carry_out(&plan);
-            let runs = runs.with_context(|| format!("task {task}"))?;
-            results.push(TaskRuns { task, runs });
+        for plan in &plans {
+            let own = self.carry_out(plan);
+            runs.extend(own.with_context(|| format!("task {}", plan.task.name))?);
         }
-        write(&render_suite(&results))
+        write(&render_suite(&runs))
     }
 
-    /// Returns the plan for a task, and reads the rows in its folder. The first plan sets `build`.
+    /// Returns the plan for a task, and reads the rows in its folder. `build` is the digest of the programs, if known.
     fn plan<'a>(
         &self,
         task: &'a Task,
         config: &AgentConfig,
-        build: &mut String,
+        build: Option<String>,
     ) -> Result<Plan<'a>> {
-        let all = task.test_seeds.clone();
-        let end = |n| all.end.min(all.start.saturating_add(n));
-        let seeds = all.start..self.worlds.map_or(all.end, end);
-        let (arena, server) = self.open(task, &seeds, 1)?;
-        if build.is_empty() {
-            *build = server.build()?;
+        let mut seeds = task.test_seeds.clone();
+        if let Some(n) = self.worlds {
+            seeds.end = seeds.end.min(seeds.start.saturating_add(n));
         }
+        let (arena, server) = self.open(task, &seeds, 1)?;
         let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
         ensure!(
             task.max_steps <= longest,
             "max_steps: expected at most {longest}, the length of the shortest episode, got {}",
             task.max_steps
         );
-        let policies = self.policies(arena.model())?;
-        let folder = self.out.join(&task.name);
-        make_folder(&folder)?;
-        let mut found = Vec::new();
-        for file in csv_files(&folder)? {
-            let runs = read_runs(&file)?;
-            found.push((file, runs));
+        let mut policies: Vec<Policy> = Vec::new();
+        let names = self.policies.iter().map(|name| &**name);
+        for name in [FLOOR, CEILING].into_iter().chain(names) {
+            let policy = Policy::named(name, &arena.model)?;
+            if !policies.contains(&policy) {
+                policies.push(policy);
+            }
         }
         let several = task.robots > 1;
         let comparison = Comparison {
-            policies: Vec::new(),
+            policies,
             teams: vec![if several { Team::Joint } else { Team::Alone }],
             seeds,
             steps: task.max_steps,
@@ -138,36 +134,39 @@ impl SuiteCommand {
             learned: Learned::default(),
             first_state_known: false,
         };
+        let folder = self.out.join(&task.name);
+        make_folder(&folder)?;
+        let mut found = Vec::new();
+        for file in csv_files(&folder)? {
+            let runs = read_tasks([file.clone()])?;
+            found.extend(runs.into_iter().map(|run| (file.clone(), run)));
+        }
         Ok(Plan {
+            task,
             worlds: comparison.worlds(arena.info()),
             comparison,
-            form: WorldForm::of(arena.model(), arena.shape()),
-            build: build.clone(),
-            task,
-            policies,
+            form: WorldForm::of(&arena.model, arena.shape()),
+            build: build.map_or_else(|| server.build(), Ok)?,
             folder,
             found,
         })
     }
 
-    /// Returns all policies of the command, each once.
-    fn policies(&self, model: &Model) -> Result<Vec<Policy>> {
-        let names = [FLOOR, CEILING].into_iter();
-        let mut policies: Vec<Policy> = Vec::new();
-        for name in names.chain(self.policies.iter().map(|name| &**name)) {
-            let policy = Policy::named(name, model)?;
-            if !policies.contains(&policy) {
-                policies.push(policy);
+    /// Trains what the policies of a task need, then runs each policy whose rows are missing or outdated. Returns all
+    /// rows, including those of other programs. Warns about policies that cannot run or were measured on other worlds,
+    /// and leaves them out.
+    fn carry_out(&self, plan: &Plan<'_>) -> Result<Vec<PolicyRun>> {
+        let (task, mut runs, mut missing) = (&plan.task.name, Vec::new(), Vec::new());
+        for policy in plan.others() {
+            let is_others =
+                |run: &&PolicyRun| run.policy == policy && run.policy_fingerprint.is_empty();
+            let rows = plan.found.iter().map(|(_, run)| run);
+            match plan.checked(policy, rows.filter(is_others)) {
+                Ok(rows) => runs.extend(rows),
+                Err(reason) => tracing::warn!("task {task}: {policy} is left out: {reason:#}"),
             }
         }
-        Ok(policies)
-    }
-
-    /// Trains what the policies of a task need, then runs each policy whose rows are missing or outdated. Returns all
-    /// rows. Warns about policies that cannot run, and leaves them out.
-    fn carry_out(&self, plan: &Plan<'_>) -> Result<Vec<PolicyRun>> {
-        let (task, mut runs, mut missing) = (&plan.task.name, plan.of_others(), Vec::new());
-        for policy in &plan.policies {
+        for policy in &plan.comparison.policies {
             let name = &policy.name;
             let trained = match self.prepare(plan, policy) {
                 Ok(trained) => trained,
@@ -177,7 +176,7 @@ impl SuiteCommand {
                     continue;
                 }
             };
-            let fingerprint = plan.fingerprint(policy, &trained.learned);
+            let fingerprint = plan.fingerprint(&trained.learned);
             match plan.kept(policy, &fingerprint) {
                 Ok(rows) => {
                     tracing::info!("task {task}: {} rows of {name} kept", rows.len());
@@ -194,9 +193,8 @@ impl SuiteCommand {
         }
         let n_worlds = plan.worlds.len() as u32;
         let (mut arena, server) = self.open(plan.task, &plan.comparison.seeds, n_worlds)?;
-        let is_same = plan.comparison.worlds(arena.info()) == plan.worlds;
         ensure!(
-            is_same && server.build()? == plan.build,
+            plan.comparison.worlds(arena.info()) == plan.worlds && server.build()? == plan.build,
             "the programs or the task's files have changed since the command began: run it again"
         );
         for (policy, trained, fingerprint) in missing {
@@ -207,6 +205,7 @@ impl SuiteCommand {
             };
             let mut new = run_comparison(&mut arena, &comparison)?.runs;
             for run in &mut new {
+                run.task.clone_from(task);
                 run.training_seconds = trained.seconds;
                 run.policy_fingerprint.clone_from(&fingerprint);
             }
@@ -225,36 +224,32 @@ impl SuiteCommand {
         let is_own =
             |run: &PolicyRun| run.policy == policy.name && !run.policy_fingerprint.is_empty();
         ensure!(
-            plan.rows_in_file_of(policy).iter().all(is_own),
+            plan.in_file_of(policy).all(is_own),
             "{} has rows of another policy or program: move the file",
             plan.file_of(policy).display()
         );
-        if !policy.needs_checkpoint() {
-            return Ok(Trained {
-                learned: Learned::default(),
-                seconds: Some(0.0),
-            });
-        }
-        let folder = self.checkpoints.as_ref();
-        let folder = folder.context("it needs a checkpoint: add --checkpoints FOLDER")?;
+        ensure!(
+            self.checkpoints.is_some() || !policy.needs_checkpoint(),
+            "it needs a checkpoint: add --checkpoints FOLDER"
+        );
+        let folder = self.checkpoints.clone().unwrap_or_default();
         let trainings = Trainings {
             folder: folder.join(&plan.task.name),
             task: plan.task,
             policy,
+            config: &plan.comparison.config,
+            steps: self.train_steps,
+            server: &self.server,
         };
-        if self.train {
-            trainings.complete(&plan.comparison.config, self.train_steps, &self.server)?;
-        }
-        trainings.read(&plan.form)
+        trainings.complete(self.train, &plan.form)
     }
 
     /// Starts a server with a task's worlds, and opens them. Dropping the server stops it.
     fn open(&self, task: &Task, seeds: &Range<u64>, n_worlds: u32) -> Result<(Arena, OwnServer)> {
-        let worlds = n_worlds.min(MAX_BATCH).to_string();
-        let seed = seeds.start.to_string();
-        let task = ["--task", &task.source, "--worlds", &worlds];
-        let flags = [&task[..], &["--seed", &seed, "--publish-truth"]].concat();
-        let flags: Vec<String> = flags.into_iter().map(String::from).collect();
+        let (worlds, seed) = (n_worlds.min(MAX_BATCH).to_string(), seeds.start.to_string());
+        let task = ["--task", &task.source, "--worlds", &worlds, "--seed", &seed];
+        let mut flags: Vec<String> = task.map(String::from).into();
+        flags.push("--publish-truth".into());
         let server = OwnServer::start(self.server.clone(), &flags)?;
         Ok((Arena::open(server.instance(), n_worlds)?, server))
     }
@@ -263,43 +258,55 @@ impl SuiteCommand {
 /// The policies and worlds of one task of a suite, and the rows that its folder had at the start.
 struct Plan<'a> {
     task: &'a Task,
-    policies: Vec<Policy>,
     worlds: Vec<World>,
-    /// The comparison, without policies and checkpoints.
+    /// The comparison of all policies, without checkpoints.
     comparison: Comparison,
     form: WorldForm,
     /// Digest of the programs.
     build: String,
     folder: PathBuf,
-    /// The files of the folder, with their rows.
-    found: Vec<(PathBuf, Vec<PolicyRun>)>,
+    /// The rows of all files, each with its file.
+    found: Vec<(PathBuf, PolicyRun)>,
 }
 
 impl Plan<'_> {
     /// Returns 16 hexadecimal digits that identify all that a policy's actions depend on, except its name and worlds.
-    fn fingerprint(&self, policy: &Policy, learned: &Learned) -> String {
-        let learned = policy.needs_checkpoint().then_some(&learned.digests);
+    fn fingerprint(&self, learned: &Learned) -> String {
         let Comparison { teams, config, .. } = &self.comparison;
         let config = toml::to_string(config).expect("invariant: settings serialise");
-        let text = format!("{}\n{config}\n{teams:?}\n{learned:?}", self.build);
-        let hash = Sha256::digest(text);
-        hash[..8].iter().map(|byte| format!("{byte:02x}")).collect()
+        let (build, learned) = (&self.build, &learned.digests);
+        let text = format!("{build}\n{config}\n{teams:?}\n{learned:?}");
+        format!("{:x}", Sha256::digest(text))[..16].into()
     }
 
-    /// Returns the path of a policy's rows.
+    /// Returns the policies of other programs, whose rows have no fingerprint.
+    fn others(&self) -> BTreeSet<&str> {
+        let own: Vec<&str> = self
+            .comparison
+            .policies
+            .iter()
+            .map(|it| &*it.name)
+            .collect();
+        let rows = self.found.iter().map(|(_, run)| run);
+        let others = rows.filter(|run| run.policy_fingerprint.is_empty());
+        let others = others.map(|run| &*run.policy);
+        others.filter(|name| !own.contains(name)).collect()
+    }
+
     fn file_of(&self, policy: &Policy) -> PathBuf {
         self.folder.join(file_of(&policy.name))
     }
 
-    fn rows_in_file_of(&self, policy: &Policy) -> &[PolicyRun] {
+    /// Returns the rows in a policy's file.
+    fn in_file_of(&self, policy: &Policy) -> impl Iterator<Item = &PolicyRun> {
         let file = self.file_of(policy);
-        let found = self.found.iter().find(|(path, _)| *path == file);
-        found.map_or(&[], |(_, runs)| runs)
+        let found = self.found.iter().filter(move |(path, _)| *path == file);
+        found.map(|(_, run)| run)
     }
 
     /// Returns the rows in a policy's file, if they are from this task's worlds and have this fingerprint.
     fn kept(&self, policy: &Policy, fingerprint: &str) -> Result<Vec<PolicyRun>> {
-        let rows = self.checked(&policy.name, self.rows_in_file_of(policy))?;
+        let rows = self.checked(&policy.name, self.in_file_of(policy))?;
         ensure!(
             rows.iter().all(|run| run.policy_fingerprint == fingerprint),
             "its rows are from another build, checkpoint or settings"
@@ -308,34 +315,15 @@ impl Plan<'_> {
     }
 
     /// Returns the rows of a policy on this suite's seeds, if there is one for each of the task's worlds.
-    fn checked(&self, policy: &str, rows: &[PolicyRun]) -> Result<Vec<PolicyRun>> {
+    fn checked<'a>(
+        &self,
+        policy: &str,
+        rows: impl Iterator<Item = &'a PolicyRun>,
+    ) -> Result<Vec<PolicyRun>> {
         let seeds = &self.comparison.seeds;
-        let is_here = |run: &&PolicyRun| run.policy == policy && seeds.contains(&run.world_seed);
-        let rows: Vec<&PolicyRun> = rows.iter().filter(is_here).collect();
-        check_worlds(policy, &rows, &self.worlds)?;
-        Ok(rows.into_iter().cloned().collect())
-    }
-
-    /// Returns the rows of other programs' policies, which have no fingerprint. Warns about policies that were measured
-    /// on other worlds, and leaves them out.
-    fn of_others(&self) -> Vec<PolicyRun> {
-        let rows = self.found.iter().flat_map(|(_, runs)| runs);
-        let rows = rows.filter(|run| {
-            let is_own = |policy: &Policy| policy.name == run.policy;
-            run.policy_fingerprint.is_empty() && !self.policies.iter().any(is_own)
-        });
+        let rows = rows.filter(|run| seeds.contains(&run.world_seed));
         let rows: Vec<PolicyRun> = rows.cloned().collect();
-        let others: BTreeSet<&str> = rows.iter().map(|run| &*run.policy).collect();
-        let mut runs = Vec::new();
-        for policy in others {
-            match self.checked(policy, &rows) {
-                Ok(rows) => runs.extend(rows),
-                Err(reason) => {
-                    let task = &self.task.name;
-                    tracing::warn!("task {task}: {policy} is left out: {reason:#}");
-                }
-            }
-        }
-        runs
+        check_worlds(policy, &rows, &self.worlds)?;
+        Ok(rows)
     }
 }

@@ -27,6 +27,10 @@ pub struct Trainings<'a> {
     pub folder: PathBuf,
     pub task: &'a Task,
     pub policy: &'a Policy,
+    pub config: &'a AgentConfig,
+    /// World steps of each training, summed over its worlds; `None`: the number in the settings.
+    pub steps: Option<u64>,
+    pub server: &'a Option<PathBuf>,
 }
 
 /// What a policy's trainings produced: its checkpoints and their training time.
@@ -37,50 +41,34 @@ pub struct Trained {
 }
 
 impl Trainings<'_> {
-    /// Reads the checkpoints.
+    /// Reads the checkpoints. If `trains`, first runs the trainings that have none.
     ///
     /// # Errors
-    /// If a checkpoint is missing or cannot be used, or if decisions were not learned on the belief next to them.
-    pub fn read(&self, world: &WorldForm) -> Result<Trained> {
-        let folders: Vec<PathBuf> = self.folders().map(|(_, folder)| folder).collect();
-        let seconds = folders.iter().map(|folder| seconds::read(folder));
-        let seconds = seconds.collect::<Result<Vec<_>>>()?;
-        let learned = read(folders.iter())?;
-        building::check(self.policy, &learned, world)?;
-        let seconds = seconds.into_iter().sum();
-        Ok(Trained { learned, seconds })
-    }
-
-    /// Runs the trainings that have no checkpoint. `steps`: world steps of each, summed over its worlds; `None`: the
-    /// number in the settings.
-    ///
-    /// # Errors
-    /// If a learner cannot learn in the task's worlds.
-    pub fn complete(
-        &self,
-        config: &AgentConfig,
-        steps: Option<u64>,
-        server: &Option<PathBuf>,
-    ) -> Result<()> {
-        let folders: Vec<(&str, PathBuf)> = self.folders().collect();
-        for (index, (learner, folder)) in folders.iter().enumerate() {
-            if folder.join(CHECKPOINT).exists() {
-                continue;
+    /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, or if a
+    /// learner cannot learn in the task's worlds.
+    pub fn complete(&self, trains: bool, world: &WorldForm) -> Result<Trained> {
+        let (mut folders, mut seconds) = (Vec::new(), Some(0.0));
+        let all: Vec<(&str, PathBuf)> = self.folders().collect();
+        for (index, (learner, folder)) in all.iter().enumerate() {
+            if trains && !folder.join(CHECKPOINT).exists() {
+                // Decisions are of no use with another belief than theirs.
+                let mut later = all[index..].iter().map(|(_, folder)| folder);
+                if let Some(other) = later.find(|folder| folder.exists()) {
+                    let (other, folder) = (other.display(), folder.display());
+                    bail!("{other} is in the way of the training for {folder}: remove it");
+                }
+                let (task, policy) = (&self.task.name, &self.policy.name);
+                tracing::info!("task {task}: training {learner} for {policy}");
+                let trained = self.train(learner, read(&folders)?, folder);
+                trained.with_context(|| format!("train --learner {learner}"))?;
             }
-            // Decisions are of no use with another belief than theirs.
-            let mut later = folders[index..].iter().map(|(_, folder)| folder);
-            if let Some(other) = later.find(|folder| folder.exists()) {
-                let (other, folder) = (other.display(), folder.display());
-                bail!("{other} is in the way of the training for {folder}: remove it");
-            }
-            let (task, policy) = (&self.task.name, &self.policy.name);
-            tracing::info!("task {task}: training {learner} for {policy}");
-            let before = folders[..index].iter().map(|(_, folder)| folder);
-            let spec = self.spec(learner, config, steps, read(before)?)?;
-            let trained = self.train(spec, folder, server.clone());
-            trained.with_context(|| format!("train --learner {learner}"))?;
+            let own = seconds::read(folder)?;
+            seconds = seconds.zip(own).map(|(sum, own)| sum + own);
+            folders.push(folder.clone());
         }
-        Ok(())
+        let learned = read(&folders)?;
+        building::check(self.policy, &learned, world)?;
+        Ok(Trained { learned, seconds })
     }
 
     /// Returns learner and folder of each training, the belief first.
@@ -94,20 +82,15 @@ impl Trainings<'_> {
         by.into_iter().chain(decisions)
     }
 
-    fn spec(
-        &self,
-        learner: &str,
-        config: &AgentConfig,
-        steps: Option<u64>,
-        learned: Learned,
-    ) -> Result<TrainingSpec> {
-        let mut config = config.clone();
+    /// Trains in a temporary folder, and renames it when the training is complete.
+    fn train(&self, learner: &str, learned: Learned, folder: &Path) -> Result<()> {
+        let mut config = self.config.clone();
         config.learner = learner.into();
         if learner == DECISIONS.name {
             config.decisions.estimator = self.policy.belief.label.into();
         }
         let kind = learners::named(learner).map_err(anyhow::Error::msg)?;
-        let steps = steps.unwrap_or(match (kind.steps)(&config) {
+        let steps = self.steps.unwrap_or(match (kind.steps)(&config) {
             0 if *kind == FILTER => config.decisions.filter_steps,
             steps => steps,
         });
@@ -115,7 +98,7 @@ impl Trainings<'_> {
             steps > 0,
             "--train-steps: expected a number of steps, as the {learner} has no default length"
         );
-        Ok(TrainingSpec {
+        let spec = TrainingSpec {
             worlds: 0..if kind.is_single { 1 } else { N_WORLDS },
             takeover: false,
             steps,
@@ -126,22 +109,27 @@ impl Trainings<'_> {
             device: Device::Cpu,
             config,
             learned,
-        })
-    }
-
-    /// Trains in a temporary folder, and renames it when the training is complete.
-    fn train(&self, spec: TrainingSpec, folder: &Path, server: Option<PathBuf>) -> Result<()> {
+        };
         make_folder(&spec.out)?;
-        let worlds = spec.worlds.len().to_string();
-        let (task, seed) = (&self.task.source, FIRST_TRAINING_SEED.to_string());
-        let flags = ["--task", task, "--worlds", &worlds, "--seed", &seed];
-        let server = start_server(server, flags.map(String::from).into(), &spec)?;
+        let (worlds, seed) = (
+            spec.worlds.len().to_string(),
+            FIRST_TRAINING_SEED.to_string(),
+        );
+        let flags = [
+            "--task",
+            &self.task.source,
+            "--worlds",
+            &worlds,
+            "--seed",
+            &seed,
+        ];
+        let server = start_server(self.server.clone(), flags.map(String::from).into(), &spec)?;
         learn(server.instance(), &spec, None, &AtomicBool::new(false))?;
         rename(&spec.out, folder).with_context(|| format!("rename to {}", folder.display()))
     }
 }
 
-fn read<'a>(folders: impl Iterator<Item = &'a PathBuf>) -> Result<Learned> {
-    let places: Vec<PathBuf> = folders.map(|it| it.join(CHECKPOINT)).collect();
+fn read(folders: &[PathBuf]) -> Result<Learned> {
+    let places: Vec<PathBuf> = folders.iter().map(|it| it.join(CHECKPOINT)).collect();
     learners::read(places.iter().map(PathBuf::as_path), &Device::Cpu)
 }

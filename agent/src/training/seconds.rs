@@ -1,6 +1,6 @@
 //! Processor seconds of a training, kept in a file in its folder.
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use emberwatch_learning::file::{Readers, replace_file};
 use rustix::time::{ClockId, clock_gettime};
 use std::path::{Path, PathBuf};
@@ -48,13 +48,12 @@ pub fn read(folder: &Path) -> Result<Option<f64>> {
     let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
     let seconds = text.trim().parse().ok();
     let seconds = seconds.filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0);
-    let wrong = || {
-        format!(
-            "{}: expected a number of seconds, got {text:?}",
-            path.display()
-        )
-    };
-    seconds.map(Some).with_context(wrong)
+    ensure!(
+        seconds.is_some(),
+        "{}: expected a number of seconds, got {text:?}",
+        path.display()
+    );
+    Ok(seconds)
 }
 
 fn processor_seconds() -> f64 {

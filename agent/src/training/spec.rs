@@ -65,13 +65,6 @@ impl TrainingSpec {
         Ok(Some(contents))
     }
 
-    /// Returns whether a checkpoint was trained with other settings.
-    pub fn has_other_settings(&self, contents: &Contents) -> bool {
-        contents
-            .settings()
-            .map_or(true, |settings| settings != self.config)
-    }
-
     /// Returns the learner that the settings name.
     pub fn learner(&self) -> Result<&'static LearnerKind> {
         learners::named(&self.config.learner).map_err(anyhow::Error::msg)

@@ -74,7 +74,7 @@ fn charts_of_results_have_all_names() {
     for (name, n_steps) in [("rewards", 1500), ("rewards_one_step", 1)] {
         let fire: Vec<f32> = (0..n_steps).map(|step| step as f32).collect();
         check(name, &names, |path| {
-            draw_rewards(path, &ladder(2, n_steps), LABEL, Some(&fire))
+            draw_rewards(path, &ladder(2, n_steps), LABEL, &fire)
         });
     }
     check("teams", &["robots", "alone", "joint"], |path| {
@@ -91,17 +91,7 @@ const HOSTILE: &str = "</text><script>&amp;\u{1}\"'";
 #[test]
 fn unusual_values_and_names_are_drawn_or_omitted() {
     let long = || "a very long name ".repeat(40);
-    for value in [
-        f64::NAN,
-        f64::INFINITY,
-        f64::MAX,
-        f64::MIN_POSITIVE,
-        -1e150,
-        -1e99,
-        2e-99,
-        1e6,
-        0.0,
-    ] {
+    for value in [f64::NAN, f64::INFINITY, f64::MAX, -1e99, 2e-99, 0.0] {
         let bar = |name: &str| Bar {
             name: name.into(),
             remark: long(),
@@ -155,7 +145,7 @@ fn results_that_cannot_be_drawn_are_errors() {
     for (drawn, words) in [
         (draw_ladder(&path, &[], LABEL), "ladder: expected at least"),
         (draw_ladder(&path, &nan, LABEL), "\"beam\" on world seed 3"),
-        (draw_rewards(&path, &one, LABEL, None), "expected points"),
+        (draw_rewards(&path, &one, LABEL, &[]), "expected points"),
         (draw_ladder(nowhere, &one, LABEL), "write /nonexist"),
     ] {
         let error = drawn.expect_err(words).to_string();

@@ -3,15 +3,10 @@
 use super::synthetic::run;
 use emberwatch_agent::benchmark::report::runs_file::{check_runs_file, read_runs, write_runs};
 use std::os::unix::fs::symlink;
-use tempfile::TempDir;
-
-fn folder() -> TempDir {
-    tempfile::tempdir().expect("a folder")
-}
 
 #[test]
 fn the_file_behind_a_link_is_replaced() {
-    let folder = folder();
+    let folder = tempfile::tempdir().expect("a folder");
     let [path, link] = ["runs.csv", "link.csv"].map(|name| folder.path().join(name));
     write_runs(&path, &[run("first", "none", 0, 1.0)]).expect("written");
     symlink(&path, &link).expect("a link");
@@ -24,7 +19,7 @@ fn the_file_behind_a_link_is_replaced() {
 
 #[test]
 fn a_byte_order_mark_and_missing_columns_do_no_harm() {
-    let folder = folder();
+    let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("runs.csv");
     write_runs(&path, &[run("mine", "none", 0, 1.0)]).expect("written");
     let text = std::fs::read_to_string(&path).expect("rows");

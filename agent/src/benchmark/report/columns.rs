@@ -1,20 +1,32 @@
-//! Tables of a comparison, with one row per group.
+//! Markdown tables, such as those of a comparison, with one row per group.
 
 use crate::benchmark::report::number::{NOTHING, number, signed, with_error};
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 
-type Cell<'a> = Box<dyn Fn(&Group<'_>) -> String + 'a>;
+/// What a column shows of each run.
+type Value<'a> = &'a dyn Fn(&PolicyRun) -> Option<f64>;
 
-/// The columns of a table, with their headings.
-#[derive(Default)]
-pub(super) struct Columns<'a>(Vec<(String, Cell<'a>)>);
+/// A table with one row per group, built column by column.
+pub(super) struct Columns<'a> {
+    groups: &'a [Group<'a>],
+    headings: Vec<String>,
+    rows: Vec<Vec<String>>,
+}
 
 impl<'a> Columns<'a> {
+    pub(super) fn new(groups: &'a [Group<'a>]) -> Self {
+        Self {
+            groups,
+            headings: Vec::new(),
+            rows: vec![Vec::new(); groups.len()],
+        }
+    }
+
     /// Returns the columns that name each group. If any group is a team, they include team and number of robots.
-    pub(super) fn of_names(groups: &[Group<'_>]) -> Self {
-        let mut columns = Self::default();
+    pub(super) fn of_names(groups: &'a [Group<'a>]) -> Self {
+        let mut columns = Self::new(groups);
         columns.add("policy", |group| group.policy.into());
         columns.add("estimator", |group| group.estimator.into());
         if groups.iter().any(Group::is_team) {
@@ -24,79 +36,61 @@ impl<'a> Columns<'a> {
         columns
     }
 
-    pub(super) fn add(&mut self, heading: &str, cell: impl Fn(&Group<'_>) -> String + 'a) {
-        self.0.push((heading.into(), Box::new(cell)));
+    pub(super) fn add(&mut self, heading: &str, cell: impl Fn(&Group<'_>) -> String) {
+        self.headings.push(heading.into());
+        let rows = self.rows.iter_mut().zip(self.groups);
+        rows.for_each(|(row, group)| row.push(cell(group)));
     }
 
     /// Adds a column of means over worlds.
-    pub(super) fn add_mean(
-        &mut self,
-        heading: &str,
-        decimals: usize,
-        value: impl Fn(&PolicyRun) -> Option<f64> + 'a,
-    ) {
-        self.add(heading, move |group| match group.estimate(&value) {
+    pub(super) fn add_mean(&mut self, heading: &str, decimals: usize, value: Value<'_>) {
+        self.add(heading, |group| match group.estimate(value) {
             Some(estimate) => number(estimate.mean, decimals),
             None => NOTHING.into(),
         });
     }
 
     /// Adds a column of means over worlds with standard errors.
-    pub(super) fn add_estimate(
-        &mut self,
-        heading: &str,
-        decimals: usize,
-        value: impl Fn(&PolicyRun) -> Option<f64> + 'a,
-    ) {
-        let cell = move |group: &Group<'_>| with_error(group.estimate(&value), decimals);
-        self.add(heading, cell);
+    pub(super) fn add_estimate(&mut self, heading: &str, decimals: usize, value: Value<'_>) {
+        self.add(heading, |it| with_error(it.estimate(value), decimals));
     }
 
     /// Adds a column of differences from the baseline policy with the same number of robots in team `alone`. The
     /// differences are paired by world.
-    pub(super) fn add_difference(
-        &mut self,
-        groups: &'a [Group<'a>],
-        baseline: &'a str,
-        decimals: usize,
-        value: impl Fn(&PolicyRun) -> Option<f64> + 'a,
-    ) {
-        self.add("difference", move |group| {
+    pub(super) fn add_difference(&mut self, baseline: &str, decimals: usize, value: Value<'_>) {
+        let groups = self.groups;
+        self.add("difference", |group| {
             let wanted = (baseline, group.robots, ALONE);
             let is_baseline = |it: &Group<'_>| (it.policy, it.robots, it.team) == wanted;
             match groups.iter().rfind(|other| is_baseline(other)) {
                 _ if is_baseline(group) => "baseline".into(),
                 None => NOTHING.into(),
                 Some(base) => {
-                    let (values, base) = (group.by_seed(&value), base.by_seed(&value));
+                    let (values, base) = (group.by_seed(value), base.by_seed(value));
                     signed(Estimate::of_difference(&values, &base), decimals)
                 }
             }
         });
     }
 
-    pub(super) fn table(&self, groups: &[Group<'_>]) -> Table {
-        let headings: Vec<&str> = self.0.iter().map(|column| &*column.0).collect();
-        let cells = |group: &Group<'_>| self.0.iter().map(|(_, cell)| cell(group)).collect();
-        markdown(&headings, groups.iter().map(cells))
+    pub(super) fn table(self) -> String {
+        let headings: Vec<&str> = self.headings.iter().map(|it| &**it).collect();
+        markdown(&headings, self.rows)
     }
 }
 
-/// Builds a Markdown table. All columns except names are right-aligned.
-pub(super) fn markdown<H: AsRef<str>>(
-    headings: &[H],
-    rows: impl Iterator<Item = Vec<String>>,
-) -> Table {
+/// Renders a table. All columns except names are right-aligned.
+pub(super) fn markdown(headings: &[&str], rows: Vec<Vec<String>>) -> String {
     let mut table = Table::new();
     table
         .load_preset(presets::ASCII_MARKDOWN)
         .set_content_arrangement(ContentArrangement::Disabled)
-        .set_header(headings.iter().map(AsRef::as_ref));
+        .set_header(headings)
+        .add_rows(rows);
     for (column, heading) in table.column_iter_mut().zip(headings) {
-        if !["policy", "estimator", "team"].contains(&heading.as_ref()) {
+        if !["policy", "estimator", "team"].contains(heading) {
             column.set_cell_alignment(CellAlignment::Right);
         }
     }
-    table.add_rows(rows);
-    table
+    table.to_string()
 }

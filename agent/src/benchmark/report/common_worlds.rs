@@ -1,56 +1,46 @@
 //! Checks that runs can be compared: that they were measured on the same worlds, over the same steps.
 
 use crate::benchmark::report::policy_run::PolicyRun;
-use anyhow::{Result, ensure};
-use std::fmt::{Display, Formatter};
+use anyhow::{Result, bail, ensure};
 
-/// A world in which a run was measured, and what was measured.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub struct World {
-    pub seed: u64,
-    pub steps: u64,
-    /// The server's `worlds_fingerprint`.
-    pub fingerprint: String,
-}
+/// Seed, number of steps and `worlds_fingerprint` of a run.
+pub type World = (u64, u64, String);
 
-impl World {
-    pub fn of(run: &PolicyRun) -> Self {
-        Self {
-            seed: run.world_seed,
-            steps: run.steps,
-            fingerprint: run.worlds_fingerprint.clone(),
-        }
-    }
-}
-
-impl Display for World {
-    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
-        let (seed, steps, fingerprint) = (self.seed, self.steps, &self.fingerprint);
-        write!(
-            f,
-            "world {seed} for {steps} steps, worlds_fingerprint {fingerprint:?}"
-        )
-    }
+/// Returns the world of each run, in ascending order.
+pub fn worlds<'a>(runs: impl IntoIterator<Item = &'a PolicyRun>) -> Vec<World> {
+    let of = |run: &PolicyRun| (run.world_seed, run.steps, run.worlds_fingerprint.clone());
+    let mut worlds: Vec<World> = runs.into_iter().map(of).collect();
+    worlds.sort();
+    worlds
 }
 
 /// Checks that a policy has one run for each of the worlds, which are in ascending order.
-pub fn check_worlds(policy: &str, runs: &[&PolicyRun], worlds: &[World]) -> Result<()> {
-    let mut found: Vec<World> = runs.iter().map(|run| World::of(run)).collect();
-    found.sort();
-    for (expected, got) in worlds.iter().zip(&found) {
+pub fn check_worlds<'a>(
+    policy: &str,
+    runs: impl IntoIterator<Item = &'a PolicyRun>,
+    expected: &[World],
+) -> Result<()> {
+    let got = worlds(runs);
+    let named = |(seed, steps, fingerprint): &World| {
+        format!("world {seed} for {steps} steps, worlds_fingerprint {fingerprint:?}")
+    };
+    for (expected, got) in expected.iter().zip(&got) {
         ensure!(
-            expected.seed == got.seed,
+            expected.0 == got.0,
             "policy {policy:?}: expected a row for world {}, got one for world {}",
-            expected.seed,
-            got.seed
+            expected.0,
+            got.0
         );
-        ensure!(
-            expected == got && !got.fingerprint.is_empty(),
+    }
+    let differs = |(a, b): &(&World, &World)| a != b || b.2.is_empty();
+    if let Some((expected, got)) = expected.iter().zip(&got).find(differs) {
+        let (expected, got) = (named(expected), named(got));
+        bail!(
             "policy {policy:?}: expected {expected}, got {got}: run it on the same worlds (model, grid, sensor, \
              moves, robots, start, burn-in)"
         );
     }
-    let (expected, got) = (worlds.len(), found.len());
+    let (expected, got) = (expected.len(), got.len());
     ensure!(
         expected == got,
         "policy {policy:?}: expected one row for each of {expected} worlds, got {got} rows"

@@ -11,8 +11,9 @@ pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<()> {
     let groups = groups(runs);
     for group in &groups {
         let name = [vec![group.policy.to_owned()], group.marks(&groups)].concat();
-        let name = name.join("-");
-        let mut file = EventFile::begin(&folder.join(plain(&name)), 0)?;
+        let is_safe = |it: char| it.is_ascii_alphanumeric() || it == '-';
+        let name = name.join("-").replace(|it| !is_safe(it), "_");
+        let mut file = EventFile::begin(&folder.join(name), 0)?;
         for (index, reward) in rewards(group).into_iter().enumerate() {
             let error = reward.standard_error;
             let error = error.map(|error| ("reward_standard_error", Value::Scalar(error)));
@@ -34,13 +35,4 @@ fn rewards(group: &Group<'_>) -> Vec<Estimate> {
         Estimate::of(&there)
     };
     (0..n_steps).filter_map(of_step).collect()
-}
-
-/// Makes a policy name safe as a folder name.
-fn plain(name: &str) -> String {
-    let plain = |letter: char| match letter {
-        'a'..='z' | 'A'..='Z' | '0'..='9' | '-' | '_' => letter,
-        _ => '_',
-    };
-    name.chars().map(plain).collect()
 }

@@ -138,12 +138,12 @@ pub fn draw_teams(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<(
 }
 
 /// Draws rewards over time, averaged over worlds, for the eight policies with the highest means.
-/// `fire_cells` is the number of burning cells per step, shaded in the background.
+/// `fire_cells` is the number of burning cells per step, shaded in the background; it can be empty.
 pub fn draw_rewards(
     path: &Path,
     runs: &[PolicyRun],
     axis_label: &str,
-    fire_cells: Option<&[f32]>,
+    fire_cells: &[f32],
 ) -> Result<()> {
     let recorded: Vec<PolicyRun> = runs
         .iter()
@@ -153,7 +153,7 @@ pub fn draw_rewards(
     for run in &recorded {
         check_finite(run, "reward", run.rewards.iter().copied().map(f64::from))?;
     }
-    let page = rewards(&recorded, axis_label, fire_cells.unwrap_or_default());
+    let page = rewards(&recorded, axis_label, fire_cells);
     save(path, &page.svg()?)
 }
 

@@ -1,40 +1,49 @@
 //! Entries of the leaderboard, one CSV file each, and the page of all entries.
 
-use crate::benchmark::report::columns::markdown;
-use crate::benchmark::report::common_worlds::{World, check_worlds};
+use crate::benchmark::report::common_worlds::{check_worlds, worlds};
 use crate::benchmark::report::number::{NOTHING, number};
 use crate::benchmark::report::policy_run::PolicyRun;
-use crate::benchmark::report::runs_file::csv_files;
+use crate::benchmark::report::runs_file::{csv_files, file_stem};
 use crate::benchmark::report::suite::{
-    CEILING, FLOOR, PARTIAL, TaskRuns, by_completeness, by_score, render_suite, score_text,
+    CEILING, FLOOR, PARTIAL, SCORE, by_score, render_suite, score_text, table, tasks,
 };
 use anyhow::{Context, Result, ensure};
+use clap::Args;
 use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_protocol::task::is_file_name;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Characters allowed in plain text besides letters and digits.
-const PUNCTUATION: &str = " .,'-_&()@+/#?=%~";
+const NAME: &str = "1 to 64 letters, digits, '-', '_' and '.', for a policy also '/' and '+'";
 
-/// One policy: its origin, and its mean reward in each world of each task.
+const PLAIN: &str = "1 to 200 letters, digits, spaces and .,'-_&()@+/#?=%~, or an address that begins with https://";
+
+/// One policy: its origin, and its runs in the worlds of each task.
 #[derive(Debug, Clone)]
 pub struct Entry {
     pub about: About,
-    pub tasks: Vec<TaskRuns>,
+    pub runs: Vec<PolicyRun>,
 }
 
-/// The origin of an entry's policy.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// The origin of an entry's policy: flags, and the first columns of the entry's file.
+#[derive(Debug, Clone, PartialEq, Args, Serialize, Deserialize)]
 pub struct About {
+    /// Name of the policy to add
+    #[arg(long, requires = "add", default_value = "", hide_default_value = true)]
     pub policy: String,
+    /// Author of the policy
+    #[arg(long, requires = "add", default_value = "", hide_default_value = true)]
     pub by: String,
-    /// Where to find the code.
+    /// Where to find its code, such as an https:// address
+    #[arg(long, requires = "add", default_value = "", hide_default_value = true)]
     pub code: String,
+    /// Commit of that code: 7 to 40 hexadecimal digits
+    #[arg(long, requires = "add", default_value = "", hide_default_value = true)]
     pub commit: String,
-    /// Processor seconds of training, summed over all tasks.
-    pub training_seconds: f64,
+    /// Processor seconds of training, summed over all tasks [default: from the rows of `suite`]
+    #[arg(long, requires = "add", value_name = "SECONDS")]
+    pub training_seconds: Option<f64>,
 }
 
 /// The columns of an entry's file; the first are those of [`About`].
@@ -46,22 +55,18 @@ impl Entry {
     pub fn read(path: &Path) -> Result<Self> {
         let mut rows = csv::Reader::from_path(path)?;
         let columns = rows.headers()?.clone();
-        let task = columns.iter().position(|name| name == "task");
-        let task = task.context("expected a column task, got none")?;
-        let mut abouts: Vec<About> = Vec::new();
-        let mut tasks: Vec<TaskRuns> = Vec::new();
+        let (mut abouts, mut runs) = (Vec::new(), Vec::new());
         for row in rows.records() {
             let row = row?;
-            abouts.push(row.deserialize(Some(&columns))?);
-            let run = row.deserialize(Some(&columns))?;
-            add(&mut tasks, &row[task], vec![run]);
+            abouts.push(row.deserialize::<About>(Some(&columns))?);
+            runs.push(row.deserialize(Some(&columns))?);
         }
         let about = abouts.pop().context("expected rows, got none")?;
         ensure!(
             abouts.iter().all(|other| *other == about),
             "expected the same policy, by, code, commit and training_seconds in all rows, got different ones"
         );
-        let entry = Self { about, tasks };
+        let entry = Self { about, runs };
         entry.check()?;
         Ok(entry)
     }
@@ -69,39 +74,18 @@ impl Entry {
     /// Checks all texts and numbers, which come from flags or files, before they reach a page.
     pub fn check(&self) -> Result<()> {
         let about = &self.about;
-        let policy = about.policy.replace(['/', '+'], "_");
-        let tasks = self.tasks.iter().map(|task| ("task", &*task.task));
-        for (what, name) in [("policy", &*policy)].into_iter().chain(tasks) {
-            ensure!(
-                is_file_name(name),
-                "{what}: expected 1 to 64 letters, digits, '-', '_' and '.', for a policy also '/' and '+', got {name:?}"
-            );
-        }
-        let columns = self
-            .runs()
-            .flat_map(|run| [("estimator", &run.estimator), ("team", &run.team)]);
-        for (what, text) in [("by", &about.by), ("code", &about.code)]
-            .into_iter()
-            .chain(columns)
-        {
-            ensure!(
-                is_plain(text),
-                "{what}: expected 1 to 200 letters, digits, spaces and {}, or an address that begins with \
-                 https://, got {text:?}",
-                PUNCTUATION.trim_start()
-            );
-        }
-        let commit = &about.commit;
-        ensure!(
-            (7..=40).contains(&commit.len()) && commit.bytes().all(|it| it.is_ascii_hexdigit()),
-            "commit: expected 7 to 40 hexadecimal digits, got {commit:?}"
-        );
-        ensure!(
-            (0.0..1e12).contains(&about.training_seconds),
-            "training_seconds: expected 0 or more, got {}",
-            about.training_seconds
-        );
-        for run in self.runs() {
+        let mut texts = BTreeSet::from([
+            ("policy", &*about.policy),
+            ("by", &about.by),
+            ("code", &about.code),
+            ("commit", &about.commit),
+        ]);
+        for run in &self.runs {
+            texts.extend([
+                ("task", &*run.task),
+                ("estimator", &run.estimator),
+                ("team", &run.team),
+            ]);
             let numbers = [Some(run.mean_reward), run.brier, run.log_likelihood];
             ensure!(
                 numbers.iter().flatten().all(|number| number.is_finite()),
@@ -109,6 +93,22 @@ impl Entry {
                 run.world_seed
             );
         }
+        for (what, text) in texts {
+            let (is_right, expected) = match what {
+                "policy" => (is_file_name(&file_stem(text)), NAME),
+                "task" => (is_file_name(text), NAME),
+                "commit" => (is_commit(text), "7 to 40 hexadecimal digits"),
+                _ => (is_plain(text), PLAIN),
+            };
+            ensure!(is_right, "{what}: expected {expected}, got {text:?}");
+        }
+        let seconds = about
+            .training_seconds
+            .context("training_seconds: expected a number, got none in the flags and rows")?;
+        ensure!(
+            (0.0..1e12).contains(&seconds),
+            "training_seconds: expected 0 or more, got {seconds}"
+        );
         Ok(())
     }
 
@@ -117,19 +117,25 @@ impl Entry {
             .has_headers(false)
             .from_writer(Vec::new());
         writer.write_record(COLUMNS.split(','))?;
-        for TaskRuns { task, runs } in &self.tasks {
-            for run in runs {
-                let what = (&run.estimator, task, run.world_seed, run.steps);
-                let who = (run.robots, &run.team);
-                let scores = (run.mean_reward, run.brier, run.log_likelihood);
-                writer.serialize((&self.about, what, who, scores, &run.worlds_fingerprint))?;
-            }
+        for run in &self.runs {
+            let what = (&run.estimator, &run.task, run.world_seed, run.steps);
+            let who = (run.robots, &run.team);
+            let scores = (run.mean_reward, run.brier, run.log_likelihood);
+            writer.serialize((&self.about, what, who, scores, &run.worlds_fingerprint))?;
         }
         replace_file(path, &writer.into_inner()?, Readers::Any)
     }
 
-    fn runs(&self) -> impl Iterator<Item = &PolicyRun> {
-        self.tasks.iter().flat_map(|task| &task.runs)
+    /// Sets the seconds of training from the rows of `suite`, unless they are known or a task's rows have none.
+    pub fn adopt_training_seconds(&mut self) {
+        let of_task = |task| self.on(task).next()?.training_seconds;
+        let recorded = tasks(&self.runs).into_iter().map(of_task).sum();
+        self.about.training_seconds = self.about.training_seconds.or(recorded);
+    }
+
+    /// Returns the runs on a task.
+    fn on(&self, task: &str) -> impl Iterator<Item = &PolicyRun> {
+        self.runs.iter().filter(move |run| run.task == task)
     }
 }
 
@@ -150,122 +156,93 @@ pub fn check_entries(entries: &[Entry]) -> Result<()> {
         format!("expected an entry of {FLOOR}, whose reward is score 0: add its results first")
     })?;
     let mut known = BTreeSet::new();
-    for Entry { about, tasks } in entries {
-        let policy = &*about.policy;
+    for entry in entries {
+        let policy = &*entry.about.policy;
         ensure!(
             known.insert(policy),
             "entry {policy}: expected one file, got several"
         );
-        for TaskRuns { task, runs } in tasks {
-            let of_floor = floor.tasks.iter().find(|other| other.task == *task);
-            let checked = of_floor
-                .with_context(|| format!("expected this task in the entry of {FLOOR}, got none"))
-                .and_then(|floor| check_runs(policy, runs, &floor.runs));
+        for task in tasks(&entry.runs) {
+            let checked = check_worlds(policy, entry.on(task), &worlds(floor.on(task)));
+            let [expected, got] = [floor, entry].map(|entry| teams(entry.on(task)));
+            let checked = checked.and_then(|()| {
+                ensure!(
+                    policy != CEILING || expected == got,
+                    "expected team {expected}, as in the entry of {FLOOR}, got {got}"
+                );
+                Ok(())
+            });
             checked.with_context(|| format!("entry {policy}, task {task}"))?;
         }
     }
     Ok(())
 }
 
-/// Checks an entry's runs on a task against the random walk's.
-fn check_runs(policy: &str, runs: &[PolicyRun], floor: &[PolicyRun]) -> Result<()> {
-    let worlds: BTreeSet<World> = floor.iter().map(World::of).collect();
-    let runs_found: Vec<&PolicyRun> = runs.iter().collect();
-    check_worlds(policy, &runs_found, &Vec::from_iter(worlds))?;
-    let [expected, got] = [floor, runs].map(|runs| joined(runs.iter().map(|run| &*run.team)));
-    ensure!(
-        policy != CEILING || expected == got,
-        "expected team {expected}, as in the entry of {FLOOR}, got {got}"
-    );
-    Ok(())
+fn is_commit(text: &str) -> bool {
+    (7..=40).contains(&text.len()) && text.bytes().all(|it| it.is_ascii_hexdigit())
 }
 
 /// Returns whether a text is safe in a Markdown table: without HTML, code, or links except web addresses.
 fn is_plain(text: &str) -> bool {
     let address = ["https://", "http://"];
     let rest = address.iter().find_map(|scheme| text.strip_prefix(scheme));
-    (1..=200).contains(&text.len())
-        && rest
-            .unwrap_or(text)
-            .chars()
-            .all(|it| it.is_alphanumeric() || PUNCTUATION.contains(it))
+    let is_allowed = |it: char| it.is_alphanumeric() || " .,'-_&()@+/#?=%~".contains(it);
+    (1..=200).contains(&text.len()) && rest.unwrap_or(text).chars().all(is_allowed)
 }
 
 /// Renders the page: one row per entry, the best first; then entries that lack a task; then each task's scores.
 pub fn render_page(entries: &[Entry]) -> String {
-    let tasks = merged(entries);
-    let policies = by_score(&tasks);
-    let (complete, partial) = by_completeness(&policies);
-    let mut parts = Vec::new();
-    for (words, heading, policies) in [("", "score [95 %]", complete), (PARTIAL, "tasks", partial)]
-    {
-        let rows = policies.iter().map(|&(policy, score)| {
-            let entry = entries.iter().find(|entry| entry.about.policy == policy);
-            let entry = entry.expect("invariant: each policy is an entry's");
-            let about = &entry.about;
-            vec![
-                policy.into(),
-                score.map_or_else(|| n_tasks(entry.tasks.len(), &tasks), score_text),
-                teams(entry),
-                number(about.training_seconds, 0),
-                about.by.clone(),
-                about.code.clone(),
-                about.commit.clone(),
-            ]
-        });
-        let headings = [
+    let runs = all_runs(entries);
+    let n_tasks = tasks(&runs).len();
+    let (mut complete, mut partial) = (Vec::new(), Vec::new());
+    for (policy, score) in by_score(&runs) {
+        let entry = entries.iter().find(|entry| entry.about.policy == policy);
+        let Entry { about, runs } = entry.expect("invariant: each policy is an entry's");
+        let (rows, result) = match score {
+            Some(score) => (&mut complete, score_text(score)),
+            None => (&mut partial, format!("{} of {n_tasks}", tasks(runs).len())),
+        };
+        rows.push(vec![
+            policy.into(),
+            result,
+            teams(runs.iter().filter(|run| run.robots > 1)),
+            number(about.training_seconds.unwrap_or_default(), 0),
+            about.by.clone(),
+            about.code.clone(),
+            about.commit.clone(),
+        ]);
+    }
+    let headings = |result| {
+        [
             "policy",
-            heading,
+            result,
             "team",
             "training, s",
             "by",
             "code",
             "commit",
-        ];
-        if rows.len() > 0 {
-            parts.extend([words.to_owned(), markdown(&headings, rows).to_string()]);
-        }
-    }
-    parts.push(render_suite(&tasks));
+        ]
+    };
+    let mut parts = table("", &headings(SCORE), complete);
+    parts.extend(table(PARTIAL, &headings("tasks"), partial));
+    parts.push(render_suite(&runs));
     parts.retain(|part| !part.is_empty());
     parts.join("\n\n")
 }
 
-/// Returns the kinds of team in which an entry's robots flew.
-fn teams(entry: &Entry) -> String {
-    let runs = entry.runs().filter(|run| run.robots > 1);
-    match joined(runs.map(|run| &*run.team)) {
-        teams if teams.is_empty() => NOTHING.into(),
-        teams => teams,
-    }
+/// Returns the runs of all entries.
+pub fn all_runs(entries: &[Entry]) -> Vec<PolicyRun> {
+    entries
+        .iter()
+        .flat_map(|entry| entry.runs.clone())
+        .collect()
 }
 
-/// Lists names, each once.
-fn joined<'a>(names: impl Iterator<Item = &'a str>) -> String {
-    let names: BTreeSet<&str> = names.collect();
-    Vec::from_iter(names).join(", ")
-}
-
-fn n_tasks(n: usize, tasks: &[TaskRuns]) -> String {
-    format!("{n} of {}", tasks.len())
-}
-
-/// Merges the tasks of all entries, in order of first appearance, each with the runs of all entries.
-pub(super) fn merged(entries: &[Entry]) -> Vec<TaskRuns> {
-    let mut tasks = Vec::new();
-    for own in entries.iter().flat_map(|entry| &entry.tasks) {
-        add(&mut tasks, &own.task, own.runs.clone());
-    }
-    tasks
-}
-
-/// Adds runs to a task's other runs.
-fn add(tasks: &mut Vec<TaskRuns>, task: &str, runs: Vec<PolicyRun>) {
-    match tasks.iter_mut().find(|other| other.task == task) {
-        Some(task) => task.runs.extend(runs),
-        None => tasks.push(TaskRuns {
-            task: task.into(),
-            runs,
-        }),
+/// Lists the kinds of team in which runs were flown.
+fn teams<'a>(runs: impl Iterator<Item = &'a PolicyRun>) -> String {
+    let teams: BTreeSet<&str> = runs.map(|run| &*run.team).collect();
+    match teams.is_empty() {
+        true => NOTHING.into(),
+        false => Vec::from_iter(teams).join(", "),
     }
 }

@@ -22,20 +22,20 @@ pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String
         heading += "No values for burning seen and front: no hidden states were published, or \
                     nothing burnt.\n";
     }
-    let mut columns = Columns::default();
+    let mut columns = Columns::new(groups);
     columns.add("policy", |group| group.name(groups));
     columns.add("detected", detected);
-    columns.add_estimate("after steps", 1, |run| {
+    columns.add_estimate("after steps", 1, &|run| {
         run.steps_to_detection.map(|steps| steps as f64)
     });
-    columns.add_estimate("burning then", 1, |run| {
+    columns.add_estimate("burning then", 1, &|run| {
         run.burning_cells_at_detection.map(f64::from)
     });
-    columns.add_estimate("burning seen %", 1, burning_seen);
-    columns.add_difference(groups, baseline, 1, burning_seen);
-    columns.add_estimate("front", 1, |run| run.front_distance);
-    columns.add_estimate("grid seen %", 1, |run| run.grid_seen_share.map(percent));
-    Some(format!("{heading}\n{}", columns.table(groups)))
+    columns.add_estimate("burning seen %", 1, &burning_seen);
+    columns.add_difference(baseline, 1, &burning_seen);
+    columns.add_estimate("front", 1, &|run| run.front_distance);
+    columns.add_estimate("grid seen %", 1, &|run| run.grid_seen_share.map(percent));
+    Some(format!("{heading}\n{}", columns.table()))
 }
 
 /// Renders the number of worlds in which fire was detected.

@@ -29,22 +29,19 @@ pub fn with_error(estimate: Option<Estimate>, decimals: usize) -> String {
 
 /// Like [`with_error`], but with a plus sign unless the mean is negative.
 pub(super) fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
-    let text = with_error(estimate, decimals);
-    let sign = if estimate.is_some() && !text.starts_with('-') {
-        "+"
-    } else {
-        ""
-    };
-    format!("{sign}{text}")
+    match with_error(estimate, decimals) {
+        text if text.starts_with('-') => text,
+        text => format!("+{text}"),
+    }
 }
 
 /// Formats a number with fixed decimals, without the sign of a negative zero.
 pub fn number(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
-    let is_zero = text
-        .strip_prefix('-')
-        .is_some_and(|digits| digits.chars().all(|digit| matches!(digit, '0' | '.')));
-    if is_zero { text[1..].into() } else { text }
+    if text.trim_start_matches(['-', '0', '.']).is_empty() {
+        return text.trim_start_matches('-').into();
+    }
+    text
 }
 
 /// Replaces the underscores of a policy's name with spaces.

@@ -62,6 +62,9 @@ pub struct PolicyRun {
     pub policy_fingerprint: String,
     /// Processor seconds of training for the world's task, if `suite` recorded them.
     pub training_seconds: Option<f64>,
+    /// The world's task, if the run is from a folder of `suite` or from the leaderboard.
+    #[serde(default, skip_serializing)]
+    pub task: String,
     /// Whether the run comes from a file given by `--add`.
     #[serde(skip)]
     pub is_added: bool,
@@ -80,6 +83,10 @@ pub struct Group<'a> {
 }
 
 impl Group<'_> {
+    fn key(&self) -> (&str, &str, u32, &str) {
+        (self.policy, self.estimator, self.robots, self.team)
+    }
+
     /// Estimates the mean over the runs that have a value.
     pub(super) fn estimate(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> Option<Estimate> {
         let values: Vec<f64> = self.runs.iter().filter_map(|run| value(run)).collect();
@@ -124,21 +131,16 @@ impl Group<'_> {
 pub fn groups(runs: &[PolicyRun]) -> Vec<Group<'_>> {
     let mut groups: Vec<Group<'_>> = Vec::new();
     for run in runs {
-        let (policy, estimator) = (run.policy.as_str(), run.estimator.as_str());
-        let (robots, team) = (run.robots, run.team.as_str());
-        let same = |group: &&mut Group<'_>| {
-            let of_group = (group.policy, group.estimator, group.robots, group.team);
-            of_group == (policy, estimator, robots, team)
+        let new = Group {
+            policy: &run.policy,
+            estimator: &run.estimator,
+            robots: run.robots,
+            team: &run.team,
+            runs: vec![run],
         };
-        match groups.iter_mut().find(same) {
+        match groups.iter_mut().find(|group| group.key() == new.key()) {
             Some(group) => group.runs.push(run),
-            None => groups.push(Group {
-                policy,
-                estimator,
-                robots,
-                team,
-                runs: vec![run],
-            }),
+            None => groups.push(new),
         }
     }
     groups

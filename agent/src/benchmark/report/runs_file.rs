@@ -49,6 +49,21 @@ pub fn read_runs(path: &Path) -> Result<Vec<PolicyRun>> {
     read().with_context(|| format!("{}: {expected}", path.display()))
 }
 
+/// Reads the runs of files whose folders have the names of the runs' tasks. Skips files that do not exist.
+pub fn read_tasks(files: impl IntoIterator<Item = PathBuf>) -> Result<Vec<PolicyRun>> {
+    let mut all = Vec::new();
+    for file in files.into_iter().filter(|file| file.is_file()) {
+        let folder = file.parent().and_then(Path::file_name).unwrap_or_default();
+        let task = folder.display().to_string();
+        let runs = read_runs(&file)?.into_iter();
+        all.extend(runs.map(|run| PolicyRun {
+            task: task.clone(),
+            ..run
+        }));
+    }
+    Ok(all)
+}
+
 /// Lists the CSV files of a folder, ordered by name.
 pub fn csv_files(folder: &Path) -> Result<BTreeSet<PathBuf>> {
     let entries = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.path()));
@@ -59,7 +74,12 @@ pub fn csv_files(folder: &Path) -> Result<BTreeSet<PathBuf>> {
 
 /// Returns the name of a policy's file. The `/` and `+` of BELIEF/PLANNER/GOAL become `_`.
 pub fn file_of(policy: &str) -> String {
-    format!("{}.csv", policy.replace(['/', '+'], "_"))
+    format!("{}.csv", file_stem(policy))
+}
+
+/// Returns [`file_of`] without its ending.
+pub fn file_stem(policy: &str) -> String {
+    policy.replace(['/', '+'], "_")
 }
 
 /// Returns the file behind a symbolic link, which is replaced instead of the link.

@@ -10,25 +10,18 @@ pub struct Estimate {
     pub mean: f64,
     /// Standard error of the mean; `None` for a single world.
     pub standard_error: Option<f64>,
-    /// Number of worlds, at least 1.
-    pub n_worlds: usize,
 }
 
 impl Estimate {
     /// Computes mean and standard error (with `n - 1`) of one value per world; `None` if there is no world.
     pub fn of(values: &[f64]) -> Option<Self> {
-        let n_worlds = values.len();
-        if n_worlds == 0 {
-            return None;
-        }
-        let n = n_worlds as f64;
+        let n = values.len() as f64;
         let mean = values.iter().sum::<f64>() / n;
         let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-        let standard_error = (n_worlds > 1).then(|| (squares / (n - 1.0) / n).sqrt());
-        Some(Self {
+        let standard_error = (n > 1.0).then(|| (squares / (n - 1.0) / n).sqrt());
+        (n > 0.0).then_some(Self {
             mean,
             standard_error,
-            n_worlds,
         })
     }
 
@@ -46,10 +39,8 @@ impl Estimate {
 /// Returns the ratio of the means over the worlds that both have. Returns `None` if they share none, or if the
 /// reference's mean is not positive, where a ratio is meaningless.
 pub fn ratio_of_means(values: &BTreeMap<u64, f64>, reference: &BTreeMap<u64, f64>) -> Option<f64> {
-    let (above, below) = shared(values, reference)
-        .fold((0.0, 0.0), |(above, below), (value, base)| {
-            (above + value, below + base)
-        });
+    let (above, below): (Vec<f64>, Vec<f64>) = shared(values, reference).unzip();
+    let (above, below): (f64, f64) = (above.iter().sum(), below.iter().sum());
     (below > 0.0).then(|| above / below)
 }
 
@@ -66,23 +57,18 @@ fn shared<'a>(
 mod tests {
     use super::*;
 
-    fn check(values: &[f64], mean: f64, standard_error: Option<f64>) {
-        let got = Estimate::of(values).expect("values");
-        assert!((got.mean - mean).abs() < 1e-12, "{got:?}");
-        match (got.standard_error, standard_error) {
-            (Some(got), Some(expected)) => assert!((got - expected).abs() < 1e-12, "{got}"),
-            (got, expected) => assert_eq!(got, expected),
-        }
-    }
-
     #[test]
     fn standard_errors_match_hand_computed_ones() {
-        // Deviations -2, 0, 2: variance 8 / 2 = 4, error sqrt(4 / 3).
-        check(&[1.0, 3.0, 5.0], 3.0, Some((4.0_f64 / 3.0).sqrt()));
-        // Deviations +-0.5: variance 0.5, error sqrt(0.5 / 2).
-        check(&[2.0, 3.0], 2.5, Some(0.5));
-        check(&[7.0, 7.0, 7.0], 7.0, Some(0.0));
-        check(&[-4.0], -4.0, None);
+        for (values, mean, error) in [
+            // Deviations -2, 0, 2: variance 8 / 2 = 4, error sqrt(4 / 3).
+            (&[1.0, 3.0, 5.0][..], 3.0, Some((4.0_f64 / 3.0).sqrt())),
+            // Deviations +-0.5: variance 0.5, error sqrt(0.5 / 2).
+            (&[2.0, 3.0], 2.5, Some(0.5)),
+            (&[-4.0], -4.0, None),
+        ] {
+            let got = Estimate::of(values).expect("values");
+            assert_eq!((got.mean, got.standard_error), (mean, error));
+        }
         assert_eq!(Estimate::of(&[]), None);
     }
 
@@ -92,21 +78,16 @@ mod tests {
         let b = BTreeMap::from([(2, 19.0), (3, 26.0), (4, 1000.0)]);
         // Differences 1 and 4: mean 2.5, variance 4.5, error sqrt(4.5 / 2) = 1.5.
         let got = Estimate::of_difference(&a, &b).expect("two shared worlds");
-        assert_eq!((got.mean, got.n_worlds), (2.5, 2));
-        assert_eq!(got.standard_error, Some(1.5));
+        assert_eq!((got.mean, got.standard_error), (2.5, Some(1.5)));
         let other = BTreeMap::from([(9, 1.0)]);
         assert_eq!(Estimate::of_difference(&a, &other), None);
     }
 
     #[test]
     fn ratios_need_a_positive_reference() {
-        let ratio = |a: &[(u64, f64)], b: &[(u64, f64)]| {
-            let [a, b] = [a, b].map(|worlds| worlds.iter().copied().collect());
-            ratio_of_means(&a, &b)
-        };
-        let a = [(1, 3.0), (2, 6.0)];
-        assert_eq!(ratio(&a, &[(1, 4.0), (2, 8.0)]), Some(0.75));
-        assert_eq!(ratio(&a, &[(1, 0.0)]), None);
-        assert_eq!(ratio(&a, &[]), None);
+        let worlds = |values: [f64; 2]| BTreeMap::from([(1, values[0]), (2, values[1])]);
+        let ratio = |reference| ratio_of_means(&worlds([3.0, 6.0]), &worlds(reference));
+        assert_eq!(ratio([4.0, 8.0]), Some(0.75));
+        assert_eq!(ratio([1.0, -1.0]), None);
     }
 }

@@ -5,7 +5,6 @@ use crate::benchmark::report::merit::merit_table;
 use crate::benchmark::report::number::{NOTHING, decimals, number};
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::ratio_of_means;
-use comfy_table::Table;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Estimator label of the oracles. The table shows rewards as a percentage of the best oracle's reward.
@@ -52,27 +51,27 @@ fn heading(runs: &[PolicyRun], groups: &[Group<'_>], baseline: &str) -> String {
     format!("{worlds}, {steps} each; {error}; {baseline}.")
 }
 
-fn summary(groups: &[Group<'_>], baseline: &str) -> Table {
+fn summary(groups: &[Group<'_>], baseline: &str) -> String {
     let decimals = decimals(groups.iter().flat_map(rewards));
     let has_teams = groups.iter().any(Group::is_team);
     let mut columns = Columns::of_names(groups);
-    columns.add_estimate("mean reward", decimals, reward);
+    columns.add_estimate("mean reward", decimals, &reward);
     if has_teams {
         let share = |run: &PolicyRun| Some(run.mean_reward / f64::from(run.robots));
-        columns.add_mean("per robot", decimals, share);
+        columns.add_mean("per robot", decimals, &share);
     }
-    columns.add_difference(groups, baseline, decimals, reward);
-    columns.add_mean("distinct cells", 1, |run| Some(run.mean_distinct_cells));
-    columns.add_mean("hit rate", 3, |run| Some(run.hit_rate));
+    columns.add_difference(baseline, decimals, &reward);
+    columns.add_mean("distinct cells", 1, &|run| Some(run.mean_distinct_cells));
+    columns.add_mean("hit rate", 3, &|run| Some(run.hit_rate));
     if has_teams {
-        columns.add_mean("repeated", 3, |run| Some(run.mean_repeated));
+        columns.add_mean("repeated", 3, &|run| Some(run.mean_repeated));
     }
     if groups.iter().any(|group| group.estimator == TRUTH) {
         columns.add("% of oracle", |group| percent_of_oracle(group, groups));
     }
-    columns.add_mean("Brier", 4, |run| run.brier);
-    columns.add_mean("ms/plan", 3, |run| Some(run.mean_plan_millis));
-    columns.table(groups)
+    columns.add_mean("Brier", 4, &|run| run.brier);
+    columns.add_mean("ms/plan", 3, &|run| Some(run.mean_plan_millis));
+    columns.table()
 }
 
 fn reward(run: &PolicyRun) -> Option<f64> {
@@ -122,12 +121,12 @@ fn split_by_fire(runs: &[PolicyRun], groups: &[Group<'_>]) -> String {
         let is_in = |run: &PolicyRun| half.iter().any(|world| world.1 == run.world_seed);
         let heading = format!("{name} fire ({})", counted(half.len(), "world"));
         let value = move |run: &PolicyRun| reward(run).filter(|_| is_in(run));
-        columns.add_estimate(&heading, decimals, value);
+        columns.add_estimate(&heading, decimals, &value);
     }
     format!(
         "Mean reward by fire, split at the median of {} burning cells:\n\n{}",
         number(median, 1),
-        columns.table(groups)
+        columns.table()
     )
 }
 
