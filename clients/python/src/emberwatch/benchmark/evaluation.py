@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, TextIO
 
 import gymnasium
@@ -103,28 +103,29 @@ def evaluate(
     if not chosen or len(set(chosen)) < len(chosen):
         raise invalid("seeds", "at least one seed, without duplicates", chosen)
     actor = Actor(policy, deterministic=deterministic)
-    arena = _arena(env, task, burn_in, wrap, keywords)
-    with arena.made(1) as (worlds, shown):
+    keywords, n_robots, fingerprint = _with_defaults(keywords, task, burn_in)
+    made = partial(_made, env, keywords, n_robots, wrap)
+    with made(1) as (worlds, shown):
         actor.check(worlds, shown)
-    if arena.keywords["truth"]:
+    if keywords["truth"]:
         batch = min(batch, wire.TRUTH_BUFFER)
     parts = set(names_of(keywords.get("observation")))
     columns = {
         "policy": name,
         "estimator": estimator or ("known_model" if OF_BELIEF & parts else "none"),
-        "robots": arena.n_robots,
-        "team": "shared" if arena.n_robots > 1 and OF_TEAM & parts else "alone",
+        "robots": n_robots,
+        "team": "shared" if n_robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,
         "recent_steps": recent_steps,
-        "worlds_fingerprint": arena.fingerprint,
+        "worlds_fingerprint": fingerprint,
     }
-    played = {(arena.fingerprint, seed, steps) for seed in chosen}
+    played = {(fingerprint, seed, steps) for seed in chosen}
     file = None if csv is None else RowFile(csv, name, played, append=append)
     report = Progress(progress, name, chosen, steps)
     rows: list[Row] = []
     try:
         for first in range(0, len(chosen), batch):
-            rows += _play(arena, actor, chosen[first : first + batch], columns, report)
+            rows += _play(made, actor, chosen[first : first + batch], columns, report)
         if file is not None:
             file.save(rows)
     except BaseException as error:
@@ -136,40 +137,10 @@ def evaluate(
     return rows
 
 
-@dataclass(frozen=True, slots=True)
-class _Arena:
-    """The worlds that a policy acts in, and their wrappers."""
-
-    env: str
-    keywords: dict[str, Any]
-    n_robots: int
-    wrap: Callable[[Any], Any] | None
-    fingerprint: str
-
-    @contextmanager
-    def made(self, n_worlds: int) -> Generator[tuple[Any, Any]]:
-        """Makes the worlds; yields them without and with their wrappers."""
-        worlds: Any = gymnasium.make_vec(
-            self.env,
-            num_envs=n_worlds * self.n_robots,
-            max_episode_steps=-1,
-            autoreset_mode=AutoresetMode.DISABLED,
-            **self.keywords,
-        )
-        worlds.unwrapped.allow_test_worlds()
-        with closing(worlds):
-            shown = worlds.unwrapped
-            if self.wrap is not None:
-                from emberwatch.benchmark.wrapped import Wrapped  # needs Stable-Baselines3
-
-                shown = Wrapped(worlds, self.wrap)
-            yield worlds.unwrapped, shown
-
-
-def _arena(
-    env: str, task: Task | None, burn_in: int | None, wrap: Any, keywords: dict[str, Any]
-) -> _Arena:
-    """Adds the defaults of an evaluation to the keywords of the environment."""
+def _with_defaults(
+    keywords: dict[str, Any], task: Task | None, burn_in: int | None
+) -> tuple[dict[str, Any], int, str]:
+    """Returns keywords with an evaluation's defaults, the number of robots and the fingerprint."""
     if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
         burn_in = 25_000
     # Hidden states can arrive late on a busy machine.
@@ -178,29 +149,50 @@ def _arena(
         with Client(keywords["instance"]) as client:
             info = client.info
         keywords.setdefault("truth", info.publish_truth)
-        return _Arena(env, keywords, info.n_robots, wrap, info.worlds_fingerprint or "")
+        return keywords, info.n_robots, info.worlds_fingerprint or ""
     keywords.setdefault("truth", True)  # worlds in this process can always reveal it
-    n_robots = keywords.get("robots") or (task.robots if task else 1)
     world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
     fingerprint = _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))
-    return _Arena(env, keywords, n_robots, wrap, fingerprint)
+    return keywords, keywords.get("robots") or (task.robots if task else 1), fingerprint
+
+
+@contextmanager
+def _made(
+    env: str, keywords: dict[str, Any], n_robots: int, wrap: Any, n_worlds: int
+) -> Generator[tuple[Any, Any]]:
+    """Makes worlds; yields them without and with their wrappers."""
+    worlds: Any = gymnasium.make_vec(
+        env,
+        num_envs=n_worlds * n_robots,
+        max_episode_steps=-1,
+        autoreset_mode=AutoresetMode.DISABLED,
+        **keywords,
+    )
+    worlds.unwrapped.allow_test_worlds()
+    with closing(worlds):
+        shown = worlds.unwrapped
+        if wrap is not None:
+            from emberwatch.benchmark.wrapped import Wrapped  # needs Stable-Baselines3
+
+            shown = Wrapped(worlds, wrap)
+        yield worlds.unwrapped, shown
 
 
 def _play(
-    arena: _Arena, actor: Actor, seeds: Sequence[int], columns: dict[str, Any], report: Progress
+    made: Any, actor: Actor, seeds: Sequence[int], columns: dict[str, Any], report: Progress
 ) -> list[Row]:
     """Scores a policy on the worlds of some seeds, all at the same time."""
     steps = columns["steps"]
-    with arena.made(len(seeds)) as (worlds, shown):
+    with made(len(seeds)) as (worlds, shown):
         tally = Tally(worlds.world_spec, len(seeds), columns["recent_steps"])
         actor.begin(len(seeds), worlds.num_envs)
-        seen, _ = shown.reset(seed=np.repeat(seeds, arena.n_robots).tolist())
-        if (worlds.lease.client.info.worlds_fingerprint or "") != arena.fingerprint:
+        seen, _ = shown.reset(seed=np.repeat(seeds, columns["robots"]).tolist())
+        if (worlds.lease.client.info.worlds_fingerprint or "") != columns["worlds_fingerprint"]:
             raise InvalidArgumentError(
                 "worlds: changed since the evaluation began; either the file of their task, model "
                 "or states has changed, or another server uses the instance"
             )
-        n_actions = worlds.world_spec.n_moves if arena.env == _MOVES else 1
+        n_actions = 1 if worlds.single_action_space.shape else worlds.world_spec.n_moves
         truncated = np.zeros(worlds.num_envs, np.bool_)
         for step in range(1, steps + 1):
             flown: list[NDArray[np.integer]] = []

@@ -56,11 +56,6 @@ class Actor:
             expected = "an environment with action masks, which the policy needs"
             raise invalid("env", expected, "one without")
         if shown is not worlds:  # wrappers normalize the observations
-            if self._normalizer is not None and not shown.is_normalized:
-                raise InvalidArgumentError(
-                    "wrap: expected a VecNormalize among the wrappers, as the policy was trained "
-                    "behind one, got none"
-                )
             self._normalizer = None
         seen = shown.single_observation_space
         expected = getattr(self._model, "observation_space", seen)

@@ -26,13 +26,12 @@ class Progress:
     def add(self, n_steps: int, *, ends: bool = False) -> None:
         """Adds steps. The last call has `ends`, also if the evaluation ends early."""
         self._n_done += n_steps
-        if self._out is not None and (ends or self._out.isatty()):
-            now, done = time.monotonic(), 100 * self._n_done // self._n_steps
-            if ends or now > self._last + 1.0:
-                self._last = now
-                start, end = "\r" if self._out.isatty() else "", "\n" if ends else ""
-                line = f"{start}{self._title}, {done} %, {now - self._begin:.0f} s"
-                print(line, end=end, file=self._out, flush=True)
+        now, done = time.monotonic(), 100 * self._n_done // self._n_steps
+        is_terminal = self._out is not None and self._out.isatty()
+        if self._out is not None and (ends or is_terminal and now > self._last + 1.0):
+            self._last = now
+            line = f"{self._title}, {done} %, {now - self._begin:.0f} s"
+            print("\r" * is_terminal + line, end="\n" * ends, file=self._out, flush=True)
 
 
 def summary(rows: Sequence[Row], *, baseline: str | None = None) -> str:

@@ -27,15 +27,12 @@ class Wrapped:
         """Wraps the worlds, and freezes the statistics of each `VecNormalize`."""
         self._base = _ScoredVecEnv(worlds)
         self._vector: Any = wrap(self._base)
-        #: Whether one of the wrappers is a `VecNormalize`.
-        self.is_normalized = False
         layer: Any = self._vector
         while layer is not self._base:
             if not isinstance(layer, VecEnvWrapper):
                 expected = "a function that returns its argument in VecEnvWrappers of SB3"
                 raise invalid("wrap", expected, repr_of(self._vector))
             if isinstance(layer, VecNormalize):
-                self.is_normalized = True
                 _freeze(layer)
             layer = layer.venv
         self.single_observation_space = self._vector.observation_space
