@@ -25,10 +25,8 @@ class Recurrent:
     """A model with a state: it counts its moves in each world, and flies in circles."""
 
     def __init__(self) -> None:
-        self.counts: list[list[int]] = []
-        self.starts: list[list[bool]] = []
+        self.calls: list[Any] = []
         self.begun: list[int] = []
-        self.deterministic: set[bool] = set()
 
     def begin(self, n_worlds: int) -> None:
         self.begun.append(n_worlds)
@@ -36,37 +34,30 @@ class Recurrent:
     def predict(
         self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> Any:
-        self.deterministic.add(deterministic)
-        self.starts.append(episode_start.tolist())
         count = np.zeros(len(seen), int) if state is None else np.where(episode_start, 0, state)
-        self.counts.append(count.tolist())
+        self.calls.append((count.tolist(), episode_start.tolist(), deterministic))
         return count % 4, count + 1
 
 
 class Forwarding(Recurrent):
     def predict(self, seen: Any, **others: Any) -> Any:  # type: ignore[override]
-        assert others.keys() == {"state", "episode_start", "deterministic"}
         return super().predict(seen, **others)
 
 
-def test_models_and_functions_receive_their_state() -> None:
-    plain = Recurrent()
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_models_and_functions_receive_their_state(deterministic: bool) -> None:
+    plain, model, forwarding = Recurrent(), Recurrent(), Forwarding()
 
-    def act(deterministic: Any, state: Any, *, episode_start: Any) -> Any:
-        # The first parameter is the observation, whatever its name.
-        return plain.predict(deterministic, state, episode_start, True)
+    def act(frames: Any, state: Any, *, episode_start: Any) -> Any:
+        return plain.predict(frames, state, episode_start, deterministic)
 
-    for model, policy in ((plain, act), *((it, it) for it in (Recurrent(), Forwarding()))):
-        go(policy, batch=2)
-        # Worlds 3 and 4 run together, then world 5 from the start.
-        counts = list(range(3 * N_MOVES))
-        assert model.counts == [[n, n] for n in counts] + [[n] for n in counts]
-        assert model.starts == [[n == 0] * 2 for n in counts] + [[n == 0] for n in counts]
-        assert model.deterministic == {True}
+    for policy in (act, model, forwarding):
+        go(policy, batch=2, deterministic=deterministic)
+    # Worlds 3 and 4 run together, then world 5 from the start.
+    moves = [(n, rows) for rows in (2, 1) for n in range(3 * N_MOVES)]
+    expected = [([n] * rows, [n == 0] * rows, deterministic) for n, rows in moves]
+    assert plain.calls == model.calls == forwarding.calls == expected
     assert (plain.begun, model.begun) == ([], [2, 1])
-    model = Recurrent()
-    go(model.predict, deterministic=False)
-    assert model.counts[-1] == [3 * N_MOVES - 1] * 3 and model.deterministic == {False}
 
 
 @pytest.mark.parametrize("n_worlds", [1, 2, 3])
@@ -134,7 +125,7 @@ def test_a_model_for_other_observations_is_refused(space: Any) -> None:
     for policy in (model, model.predict):
         with refuses("policy: expected the observations .*: pass the observation= .* wrap=, such"):
             go(policy)
-    assert model.counts == []
+    assert model.calls == []
     for fits in (FRAME, spaces.Box(0, 255, (1, 7, 9), np.uint8)):  # channels first
         model.observation_space = fits
         go(model)

@@ -1,6 +1,5 @@
 """Models of Stable-Baselines3 score the same in `evaluate` as in their own evaluation."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +26,13 @@ N_MOVES, N_STEPS, N_WORLDS, FIRST = 4, 10, 4, 1000
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 1, "learning_rate": 3e-3, "device": "cpu"}
 
-Wrap = Callable[[Any], Any]
-
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return {**WORLDS, "model": wall(tmp_path_factory.mktemp("model"))}
 
 
-def vector(world: dict[str, Any], seed: int, wrap: Wrap | None = None, **changes: Any) -> Any:
+def vector(world: dict[str, Any], seed: int, wrap: Any = None, **changes: Any) -> Any:
     """Makes worlds with seeds from `seed`, as for training or evaluation."""
     keywords = {"observation": "local", "max_episode_steps": N_MOVES * N_STEPS, **changes}
     made = make_vec_env(MOVES, N_WORLDS, **world, **keywords)
@@ -43,23 +40,10 @@ def vector(world: dict[str, Any], seed: int, wrap: Wrap | None = None, **changes
     return made if wrap is None else wrap(made)
 
 
-def trained(
-    algorithm: Any, policy: str, world: dict[str, Any], wrap: Wrap | None = None, **changes: Any
-) -> Any:
+def trained(algorithm: Any, policy: str, world: Any, wrap: Any = None, **changes: Any) -> Any:
     observation = changes.pop("observation", "local")
     worlds = vector(world, 5000, wrap, reward="move", observation=observation)
-    model = algorithm(policy, VecMonitor(worlds), seed=3, **SMALL | changes)
-    return model.learn(128)
-
-
-def remembering(world: dict[str, Any]) -> Any:
-    """Makes a model whose state affects its actions; short training alone would not suffice."""
-    small = {"lstm_hidden_size": 16, "net_arch": []}
-    model = trained(sb3_contrib.RecurrentPPO, "MlpLstmPolicy", world, policy_kwargs=small)
-    model.policy.lstm_actor.weight_hh_l0.data *= 20.0
-    weights = model.policy.action_net.weight
-    weights.data = torch.randn(weights.shape, generator=torch.Generator().manual_seed(2))
-    return model
+    return algorithm(policy, VecMonitor(worlds), seed=3, **SMALL | changes).learn(128)
 
 
 def own(model: Any, worlds: Any, *, deterministic: bool, evaluation: Any = evaluate_policy) -> Any:
@@ -92,7 +76,12 @@ def test_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any], deterministi
 
 
 def test_recurrent_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any]) -> None:
-    model = remembering(world)
+    # A model whose state affects its actions; short training alone would not suffice.
+    small = {"lstm_hidden_size": 16, "net_arch": []}
+    model = trained(sb3_contrib.RecurrentPPO, "MlpLstmPolicy", world, policy_kwargs=small)
+    model.policy.lstm_actor.weight_hh_l0.data *= 20.0
+    weights = model.policy.action_net.weight
+    weights.data = torch.randn(weights.shape, generator=torch.Generator().manual_seed(2))
     expected = own(model, vector(world, FIRST), deterministic=True)
     check(model, expected, world)
     # Without its state, the model acts differently, so the test does depend on the state.
@@ -106,9 +95,7 @@ def stacked(worlds: Any) -> Any:
 
 
 @pytest.mark.parametrize("wrap", [None, stacked])
-def test_maskable_ppo_scores_as_in_its_own_evaluation(
-    world: dict[str, Any], wrap: Wrap | None
-) -> None:
+def test_maskable_ppo_scores_as_in_its_own_evaluation(world: dict[str, Any], wrap: Any) -> None:
     model = trained(sb3_contrib.MaskablePPO, "MlpPolicy", world, wrap)
     worlds = vector(world, FIRST, wrap)
     expected = own(model, worlds, deterministic=True, evaluation=evaluate_masked)
@@ -154,20 +141,15 @@ def test_a_model_with_vec_normalize_scores_as_in_its_own(
 
 def n_seen(normalize: Any) -> list[float]:
     """Returns the number of observations in each statistic."""
-    statistics = normalize.obs_rms
-    return [
-        it.count for it in (statistics.values() if isinstance(statistics, dict) else [statistics])
-    ]
+    parts = normalize.obs_rms
+    return [it.count for it in (parts.values() if isinstance(parts, dict) else [parts])]
 
 
 def test_functions_receive_wrapped_observations(world: dict[str, Any]) -> None:
-    shapes = set()
-
     def act(seen: Any) -> Any:
-        shapes.add(seen.shape)
+        assert seen.shape == (N_WORLDS, 15, 15, 10)
         return np.zeros(len(seen), int)
 
     ours(act, world, wrap=stacked)
-    assert shapes == {(N_WORLDS, 15, 15, 10)}
     with refuses("wrap: expected a function that returns its argument in VecEnvWrappers of SB3"):
         ours(act, world, wrap=lambda worlds: None)
