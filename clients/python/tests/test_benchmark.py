@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks import WORLDS
+from benchmarks import WORLDS, play
 from environments import LIVELY, MOVES, RECORDED, WILDFIRE
 from failures import refuses
 from numpy.typing import NDArray
@@ -22,8 +22,8 @@ FLAGS: dict[str, Any] = {"height": 7, "width": 9, "moves": 4, "model": LIVELY, "
 SCALE: dict[str, Any] = {"seeds": range(3, 7), "steps": 12, "progress": None}
 
 
-def walk(seed: int) -> Callable[[Any], NDArray[np.int64]]:
-    rng = np.random.default_rng(seed)
+def walk() -> Callable[[Any], NDArray[np.int64]]:
+    rng = np.random.default_rng(0)
     return lambda seen: rng.integers(0, 4, len(seen))
 
 
@@ -42,9 +42,8 @@ def compare(*flags: object) -> str:
     return done.stdout
 
 
-def score(path: Path | None = None, name: str = "mine", **changes: Any) -> list[Row]:
-    keywords = {**WORLDS, **SCALE, "observation": "frame", **changes}
-    return evaluate(walk(0), name=name, csv=path, **keywords)
+def score(name: str = "mine", **changes: Any) -> list[Row]:
+    return play(changes.pop("policy", walk()), name, **SCALE | changes)
 
 
 @pytest.fixture
@@ -64,10 +63,10 @@ def test_replayed_paths_have_exactly_the_same_scores(
 ) -> None:
     settings, worlds = FLAGS, WORLDS
     if policy == "coverage":  # needs no model, as recorded worlds have none
-        recorded = {"states": states, "states_symmetries": True}
-        settings, worlds = {"moves": 4, **recorded}, {"n_moves": 4, **recorded}
-    settings = {"height": None, "width": None, "burn_in": None, **settings, "robots": robots}
-    running = server(worlds=5, publish_truth=True, coverage="client", **settings)
+        worlds = {"n_moves": 4, "states": states, "states_symmetries": True}
+        settings = {"moves": 4, "states": states, "states_symmetries": True}
+        settings |= dict.fromkeys(("height", "width", "burn_in"))
+    running = server(worlds=5, publish_truth=True, coverage="client", robots=robots, **settings)
     file, csv = tmp_path / "beam.recording", tmp_path / "theirs.csv"
     recorder = subprocess.Popen(
         [find("emberwatch-server"), "record", f"--instance={running.instance}", f"--out={file}"]
@@ -97,8 +96,8 @@ def test_replayed_paths_have_exactly_the_same_scores(
 
 def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
     file, figures = tmp_path / "mine.csv", tmp_path / "figures"
-    score(file)
-    score(file, name="other", append=True)
+    for name in ("mine", "other"):
+        score(name, csv=file, append=True)
     flags = ["--policies=random_walk,coverage", "--baseline=coverage", f"--add={file}"]
     flags += [f"--{name.replace('_', '-')}={value}" for name, value in FLAGS.items()]
     shown = compare(*flags, f"--figures={figures}", f"--csv={tmp_path / 'all.csv'}")
@@ -109,13 +108,9 @@ def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
 
 
 def test_a_row_names_the_estimator_of_the_belief() -> None:
-    for observation, estimator, expected in (
-        ("frame", None, "none"),
-        ("local", None, "known_model"),
-        ("local", "mine", "mine"),
-    ):
-        (row,) = score(seeds=[3], steps=1, observation=observation, estimator=estimator)
-        assert row.estimator == expected
+    for changes, expected in (({}, "known_model"), ({"estimator": "mine"}, "mine")):
+        assert {row.estimator for row in score(observation="local", **changes)} == {expected}
+    assert {row.estimator for row in score()} == {"none"}
 
 
 def rows_of(policy: str, *rewards: float, first: int = 1000, **changes: Any) -> list[Row]:
@@ -168,6 +163,7 @@ def test_rows_that_do_not_pair_are_refused() -> None:
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
+        ({"policy": None}, "policy: expected a function of observations, or a model of .*, got No"),
         ({"name": ""}, "name: expected a name for the table, got ''"),
         ({"estimator": "a\nb"}, r"estimator: expected a name for the table, got 'a\\nb'"),
         ({"seeds": []}, "seeds: expected at least one seed, without duplicates"),
@@ -188,7 +184,7 @@ def test_wrong_evaluation_arguments_are_named(changes: dict[str, Any], problem: 
 def test_some_figures_need_no_hidden_states(flags: dict[str, Any], tmp_path: Path) -> None:
     running = server(worlds=4, **FLAGS, **flags)
     keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
-    rows = evaluate(walk(0), name="mine", csv=tmp_path / "mine.csv", **keywords)
+    rows = evaluate(walk(), name="mine", csv=tmp_path / "mine.csv", **keywords)
     of_truth = ("burning_seen_share", "front_distance")
     assert {getattr(row, name) for row in rows for name in of_truth} == {None}
     assert [figures(it, *of_truth) for it in rows] == [figures(it, *of_truth) for it in score()]
@@ -196,6 +192,5 @@ def test_some_figures_need_no_hidden_states(flags: dict[str, Any], tmp_path: Pat
 
 
 def test_episodes_that_are_too_short_are_refused(states: Path) -> None:
-    keywords = {"n_moves": 4, "states": states, "observation": "frame", "progress": None}
     with refuses("steps: expected at most 12, .*, got 13"):
-        evaluate(walk(0), name="mine", steps=13, **keywords)
+        evaluate(walk(), name="mine", n_moves=4, states=states, observation="frame", steps=13)

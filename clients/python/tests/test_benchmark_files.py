@@ -13,21 +13,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks import WORLDS
+from benchmarks import play
 from environments import LIVELY
 from failures import refuses
 
-from emberwatch.benchmark import Row, evaluate, read, suite
+from emberwatch.benchmark import Row, read, suite
 from emberwatch.errors import ExistingFileError
 
 
-def go(
-    csv: object, name: str = "mine", policy: Callable[[Any], Any] | None = None, **changes: Any
-) -> list[Row]:
+def go(csv: object, name: str = "mine", policy: Any = None, **changes: Any) -> list[Row]:
     """Evaluates a policy that by default never acts."""
-    keywords = {**WORLDS, "observation": "frame", "seeds": range(3, 6), "steps": 5, **changes}
-    keywords = {"progress": None, "batch": 1} | keywords
-    return evaluate(policy or (lambda _: pytest.fail("acts")), name=name, csv=csv, **keywords)
+    policy = policy or (lambda _: pytest.fail("acts"))
+    return play(policy, name, csv=csv, **{"batch": 1} | changes)
 
 
 def always(move: int) -> Callable[[Any], Any]:
@@ -54,20 +51,17 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "mine.csv"
 
 
-def rewards(rows: list[Row]) -> list[float]:
-    return [row.mean_reward for row in rows]
-
-
 def check_plays(policies: Callable[[int], Any], folder: Path) -> None:
     """Checks that policies that make one move score as functions that make this move."""
-    scores = [rewards(go(folder / f"{move}.csv", policy=policies(move))) for move in (3, 1)]
-    assert scores == [rewards(go(None, policy=always(move))) for move in (3, 1)]
+    scores = []
+    for move in (3, 1):
+        both = go(folder / f"{move}.csv", policy=policies(move)), go(None, policy=always(move))
+        (one,) = {tuple(row.mean_reward for row in rows) for rows in both}
+        scores.append(one)
     assert scores[0] != scores[1]
 
 
-def test_a_policy_whose_module_was_edited_is_played(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_whose_module_was_edited_is_played(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
@@ -127,12 +121,9 @@ def control_c() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize(
-    ("stop", "cause"), [(control_c, KeyboardInterrupt), (lambda: 1 / 0, ZeroDivisionError)]
-)
-def test_an_interrupted_evaluation_leaves_the_finished_rows(
-    file: Path, stop: Callable[[], object], cause: type[BaseException]
-) -> None:
+@pytest.mark.parametrize("stop", [control_c, lambda: 1 / 0])
+def test_an_interrupted_evaluation_leaves_the_finished_rows(file: Path, stop: Any) -> None:
+    cause = KeyboardInterrupt if stop is control_c else ZeroDivisionError
     whole, said = go(file, policy=up), io.StringIO()
     with pytest.raises(cause) as raised:
         go(file, "other", after(10, stop), append=True)
@@ -140,8 +131,7 @@ def test_an_interrupted_evaluation_leaves_the_finished_rows(
     with pytest.raises(cause) as raised:
         go(file, "other", after(50, stop), append=True, progress=said)
     assert said.getvalue() == "other: 3 test worlds, 80 %, 0 s\n"
-    note = f"2 of 3 worlds finished, their rows are in {file}.partial"
-    assert raised.value.__notes__ == [note]
+    assert raised.value.__notes__ == [f"2 of 3 worlds finished, their rows are in {file}.partial"]
     rows = read(f"{file}.partial")
     assert [(it.policy, it.world_seed) for it in rows] == [("other", 3), ("other", 4)]
     assert read(file) == whole and len(list(file.parent.iterdir())) == 2
@@ -177,7 +167,6 @@ def test_a_full_disk_keeps_the_old_file_and_shows_the_rows(file: Path) -> None:
     go(file, policy=up)
     kept, limits = file.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-
     fill = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (500, limits[1]))
     try:
         with refuses("csv: expected a file that can be written, got .*: .*File too large") as full:
@@ -221,9 +210,7 @@ def test_files_of_other_programs_are_read(file: Path) -> None:
         ({"policy": {"team": up}}, "policy: expected one for the task small, got team"),
     ],
 )
-def test_a_suite_is_refused_before_it_runs(
-    tmp_path: Path, changes: dict[str, Any], problem: str
-) -> None:
+def test_a_suite_is_refused_before_it_runs(tmp_path: Path, changes: Any, problem: str) -> None:
     (tmp_path / "small").mkdir()
     (tmp_path / "small" / "mine.csv").touch()
     chosen = {"policy": up, "name": "mine", "tasks": ["small"], "folder": tmp_path} | changes
