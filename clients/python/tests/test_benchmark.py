@@ -2,59 +2,55 @@
 
 import subprocess
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import WORLDS, play
 from environments import LIVELY, MOVES, RECORDED, WILDFIRE
 from failures import refuses
 from numpy.typing import NDArray
 from processes import find, server
 
 import emberwatch
-from emberwatch.benchmark import Row, evaluate, read, summary
+from emberwatch.benchmark import FIRST_TRAINING_SEED, Row, evaluate, read, summary
 from emberwatch.client import recording
 
-WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 6, "model": LIVELY, "burn_in": 60}
+FLAGS: dict[str, Any] = {"height": 7, "width": 9, "moves": 4, "model": LIVELY, "burn_in": 60}
 SCALE: dict[str, Any] = {"seeds": range(3, 7), "steps": 12, "progress": None}
-PLAIN = "world_seed steps mean_reward mean_distinct_cells hit_rate mean_fire_cells moves".split()
-MERIT = (
-    "steps_to_detection burning_cells_at_detection recent_steps burning_seen_share front_distance "
-    "grid_seen_share"
-).split()
 
 
-def walk(seed: int) -> Callable[[Any], NDArray[np.int64]]:
-    rng = np.random.default_rng(seed)
-    return lambda frames: rng.integers(0, 4, len(frames))
+def walk() -> Callable[[Any], NDArray[np.int64]]:
+    rng = np.random.default_rng(0)
+    return lambda seen: rng.integers(0, 4, len(seen))
 
 
-def compare(
-    *flags: object, seeds: str = "3..7", steps: int = 12
-) -> subprocess.CompletedProcess[str]:
-    command = [find("emberwatch-agent"), "compare", f"--seeds={seeds}", f"--steps={steps}"]
-    command += [str(flag) for flag in flags]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+def figures(row: Row, *others: str) -> dict[str, Any]:
+    """Returns the columns that do not depend on the program, except some others."""
+    others += ("policy", "estimator", "team", "brier", "log_likelihood")
+    others += ("mean_plan_millis", "training_seconds")
+    return {name: value for name, value in asdict(row).items() if name not in others}
 
 
-def private(**changes: object) -> list[str]:
-    flags = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn-in": 60, **changes}
-    return [f"--{name}={value}" for name, value in flags.items()]
+def compare(*flags: object) -> str:
+    """Runs the agent's `compare` on the worlds of `SCALE`; returns its output."""
+    command = [find("emberwatch-agent"), "compare", "--seeds=3..7", "--steps=12", *map(str, flags)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
-def score(path: Path | None = None, name: str = "mine", **changes: Any) -> list[Row]:
-    keywords = {**WORLDS, **SCALE, "observation": "frame", **changes}
-    return evaluate(walk(0), name=name, csv=path, **keywords)
+def score(name: str = "mine", **changes: Any) -> list[Row]:
+    return play(changes.pop("policy", walk()), name, **SCALE | changes)
 
 
 @pytest.fixture
 def states(tmp_path: Path) -> Path:
-    """Writes recorded worlds of 12 and 15 steps, in which the second of three states pays most."""
+    """Writes a recorded world of 12 steps, in which the second of three states pays most."""
     path = tmp_path / "lab.npz"
-    random = np.random.default_rng(5)
-    sequences = [random.integers(0, 3, (length, 7, 9), np.uint8) for length in (13, 16)]
-    np.savez(path, states_000=sequences[0], states_001=sequences[1])
+    np.savez(path, states_000=np.random.default_rng(5).integers(0, 3, (13, 7, 9), np.uint8))
     path.with_suffix(".toml").write_bytes(RECORDED.read_bytes())
     return path
 
@@ -65,15 +61,13 @@ def states(tmp_path: Path) -> Path:
 def test_replayed_paths_have_exactly_the_same_scores(
     tmp_path: Path, states: Path, robots: int, recent_steps: int, policy: str
 ) -> None:
-    settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
-    worlds = WORLDS
+    settings, worlds = FLAGS, WORLDS
     if policy == "coverage":  # needs no model, as recorded worlds have none
-        settings = {"height": None, "width": None, "moves": 6, "burn_in": None}
-        settings |= {"states": states, "states_symmetries": True}
-        worlds = {"n_moves": 6, "states": states, "states_symmetries": True}
-    settings["robots"] = robots
-    running = server(worlds=5, publish_truth=True, coverage="client", **settings)
-    file = tmp_path / "beam.recording"
+        worlds = {"n_moves": 4, "states": states, "states_symmetries": True}
+        settings = {"moves": 4, "states": states, "states_symmetries": True}
+        settings |= dict.fromkeys(("height", "width", "burn_in"))
+    running = server(worlds=5, publish_truth=True, coverage="client", robots=robots, **settings)
+    file, csv = tmp_path / "beam.recording", tmp_path / "theirs.csv"
     recorder = subprocess.Popen(
         [find("emberwatch-server"), "record", f"--instance={running.instance}", f"--out={file}"]
     )
@@ -81,20 +75,13 @@ def test_replayed_paths_have_exactly_the_same_scores(
         with emberwatch.connect(running.instance) as client:
             while not client.status().n_observers:
                 pass
-        csv = tmp_path / "theirs.csv"
         flags = [f"--instance={running.instance}", f"--csv={csv}", "--team=joint"]
-        flags += [f"--recent-steps={recent_steps}"]
-        done = compare(f"--policies={policy}", *flags)
-        assert done.returncode == 0, done.stderr
+        compare(f"--policies={policy}", f"--recent-steps={recent_steps}", *flags)
     finally:
         recorder.terminate()
         recorder.wait(20)
-    samples = (record.sample for record in recording.read(file))
-    frames = [sample for sample in samples if isinstance(sample, emberwatch.Frame)]
-    paths = {
-        (frame.result.seed, frame.result.step): [robot.path for robot in frame.robots]
-        for frame in frames
-    }
+    frames = [it.sample for it in recording.read(file) if isinstance(it.sample, emberwatch.Frame)]
+    paths = {(it.result.seed, it.result.step): [one.path for one in it.robots] for it in frames}
     steps = iter(range(1, 13))
 
     def again(_: Any) -> NDArray[np.int64]:
@@ -102,59 +89,35 @@ def test_replayed_paths_have_exactly_the_same_scores(
         return np.concatenate([paths[seed, step] for seed in range(3, 7)]).astype(np.int64)
 
     keywords = {**worlds, **SCALE, "robots": robots, "recent_steps": recent_steps}
-    rows = evaluate(again, name="again", env=WILDFIRE, **keywords)
-    theirs = read(csv)
-    assert len(rows) == len(theirs) == 4
-    for mine, other in zip(rows, theirs, strict=True):
-        for value in (*PLAIN, *MERIT):
-            assert getattr(mine, value) == getattr(other, value), value
-        assert None not in [getattr(mine, value) for value in MERIT]
+    rows = [figures(row) for row in evaluate(again, name="again", env=WILDFIRE, **keywords)]
+    assert rows == [figures(row) for row in read(csv)]
+    assert len(rows) == 4 and None not in [value for row in rows for value in row.values()]
 
 
 def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
     file, figures = tmp_path / "mine.csv", tmp_path / "figures"
-    score(file)
-    score(file, name="other", append=True)
+    for name in ("mine", "other"):
+        score(name, csv=file, append=True)
     flags = ["--policies=random_walk,coverage", "--baseline=coverage", f"--add={file}"]
-    done = compare(*flags, f"--figures={figures}", f"--csv={tmp_path / 'all.csv'}", *private())
-    assert done.returncode == 0, done.stderr
-    assert "| mine " in done.stdout and "| other " in done.stdout
+    flags += [f"--{name.replace('_', '-')}={value}" for name, value in FLAGS.items()]
+    shown = compare(*flags, f"--figures={figures}", f"--csv={tmp_path / 'all.csv'}")
+    assert "| mine " in shown and "| other " in shown
     assert "\nmine" in (figures / "ladder.svg").read_text()
     names = {row.policy for row in read(tmp_path / "all.csv")}
     assert names == {"random_walk", "coverage", "mine", "other"}
 
 
 def test_a_row_names_the_estimator_of_the_belief() -> None:
-    for changes, expected in (
-        ({"observation": "frame"}, "none"),
-        ({"observation": "local"}, "known_model"),
-        ({"observation": ["frame", "belief"]}, "known_model"),
-        ({"observation": "local", "estimator": "mine"}, "mine"),
-    ):
-        keywords = {**WORLDS, **SCALE, "seeds": [3], "steps": 1, **changes}
-        (row,) = evaluate(lambda _: np.zeros(1, int), name="mine", **keywords)
-        assert row.estimator == expected
-
-
-def test_a_summary_counts_the_test_worlds() -> None:
-    rows = score(seeds=[3, 5000], steps=2)
-    assert summary(rows).endswith("a step on 2 (1 test) worlds")
-    assert summary(rows[:1]).endswith(" a step on 1 test world, too few for a standard error")
-    assert summary(rows[1:]).endswith(" a step on 1 world, too few for a standard error")
-    with refuses("rows: expected at least one, got none"):
-        summary([])
+    for changes, expected in (({}, "known_model"), ({"estimator": "mine"}, "mine")):
+        assert {row.estimator for row in score(observation="local", **changes)} == {expected}
+    assert {row.estimator for row in score()} == {"none"}
 
 
 def rows_of(policy: str, *rewards: float, first: int = 1000, **changes: Any) -> list[Row]:
-    values: dict[str, Any] = {
-        **{"policy": policy, "estimator": "none", "steps": 5, "moves": 4, "mean_plan_millis": 0.1},
-        **{"mean_distinct_cells": 4.0, "hit_rate": 0.1, "mean_fire_cells": 9.0, "brier": ""},
-        **{"worlds_fingerprint": "ab"},
-    }
-    return [
-        Row(world_seed=seed, mean_reward=reward, **values | changes)
-        for seed, reward in enumerate(rewards, first)
-    ]
+    values: dict[str, Any] = {"policy": policy, "estimator": "none", "steps": 5, "moves": 4}
+    values |= {"mean_distinct_cells": 4.0, "hit_rate": 0.1, "mean_fire_cells": 9.0, "brier": ""}
+    values |= {"mean_plan_millis": 0.1, "worlds_fingerprint": "ab", **changes}
+    return [Row(world_seed=at, mean_reward=it, **values) for at, it in enumerate(rewards, first)]
 
 
 def test_a_summary_has_differences_from_a_baseline() -> None:
@@ -170,66 +133,64 @@ def test_a_summary_has_differences_from_a_baseline() -> None:
     # Differences 0.1, 0.3 and eight zeros: t with 9 degrees of freedom is 2.262.
     ten = rows_of("base", *[0.0] * 10) + rows_of("better", 0.1, 0.3, *[0.0] * 8)
     assert summary(ten, baseline="base").endswith("+0.04 +- 0.03 [-0.03, +0.11]")
+    tests = rows_of("base", 1.0, 2.0, first=FIRST_TRAINING_SEED - 1)
+    assert summary(tests).endswith("a step on 2 (1 test) worlds")
+    assert summary(tests[:1]).endswith("a step on 1 test world, too few for a standard error")
+    with refuses("rows: expected at least one, got none"):
+        summary([])
     one = summary(base[:1] + better[:1], baseline="base").splitlines()[1]
     assert one.endswith("on 1 world, too few for a standard error; difference from base: +1.00")
-    for rows, problem in (
-        (better, "baseline: expected the name of one of the policies better, got 'base'"),
-        (base + rows_of("base", 1.0, team="shared"), "baseline: expected the name of one of the"),
-        (base + better[:2], "rows: expected one for each of the same worlds and steps of 'better'"),
-        (base + better + better, "rows: expected one for each of the same worlds and steps of"),
-        (base + rows_of("x", 1.0, 2.0, 4.0, first=1001), "rows: expected one for each of the same"),
-        (base + rows_of("x", 1.0, 2.0, 4.0, steps=6), "rows: expected one for each of the same w"),
-        (base + rows_of("x", 1.0, worlds_fingerprint="cd"), "in all rows, got 'ab', 'cd'"),
-        (rows_of("base", 1.0, worlds_fingerprint=""), "worlds_fingerprint in all rows, got ''"),
+
+
+def test_rows_that_do_not_pair_are_refused() -> None:
+    base = rows_of("base", 1.0, 2.0)
+    for rows in (rows_of("x", 1.0), base + rows_of("base", 1.0, team="shared")):
+        with refuses("baseline: expected the name of one of the policies .*, got 'base'"):
+            summary(rows, baseline="base")
+    unknown = {"worlds_fingerprint": ""}
+    for rows in (
+        base + rows_of("x", 1.0),
+        base + 2 * rows_of("x", 1.0, 2.0),
+        base + rows_of("x", 1.0, 2.0, first=1001),
+        base + rows_of("x", 1.0, 2.0, steps=6),
+        base + rows_of("x", 1.0, 2.0, worlds_fingerprint="cd"),
+        rows_of("base", 1.0, **unknown) + rows_of("x", 1.0, **unknown),
     ):
-        with refuses(problem):
+        with refuses("rows: expected the same worlds_fingerprint, seeds and steps of 'x' and 'bas"):
             summary(rows, baseline="base")
 
 
-#: Wrong arguments of `evaluate`, each with words of its error.
-WRONG: list[tuple[dict[str, Any], str]] = [
-    ({"name": ""}, "name: expected a name for the table, got ''"),
-    ({"estimator": "a\nb"}, r"estimator: expected a name for the table, got 'a\\nb'"),
-    *(({"seeds": it}, "seeds: expected at least one seed, without dup") for it in ([], [4, 4])),
-    ({"seeds": 8}, r"seeds: expected several seeds, such as range\(8\), got 8"),
-    ({"observation": None}, "observation: expected one or several of"),
-    ({"seeds": [-1]}, "seed: expected an integer"),
-    *(
-        ({name: 0}, f"{name}: expected an integer within 1 to 4294967295, got 0")
-        for name in ("steps", "batch", "recent_steps")
-    ),
-    ({"env": "CartPole-v1"}, f"env: expected '{MOVES}' or '{WILDFIRE}', got 'CartPole-v1'"),
-]  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"policy": None}, "policy: expected a function of observations, or a model of .*, got No"),
+        ({"name": ""}, "name: expected a name for the table, got ''"),
+        ({"estimator": "a\nb"}, r"estimator: expected a name for the table, got 'a\\nb'"),
+        ({"seeds": []}, "seeds: expected at least one seed, without duplicates"),
+        ({"seeds": [4, 4]}, "seeds: expected at least one seed, without duplicates"),
+        ({"seeds": 8}, "seeds: expected one for each world, got int"),
+        ({"seeds": [-1]}, "seed: expected an integer"),
+        ({"batch": 0}, "batch: expected an integer within 1 to 4294967295, got 0"),
+        ({"observation": None}, "observation: expected one or several of"),
+        ({"env": "CartPole-v1"}, f"env: expected '{MOVES}' or '{WILDFIRE}', got 'CartPole-v1'"),
+    ],
+)
+def test_wrong_evaluation_arguments_are_named(changes: dict[str, Any], problem: str) -> None:
+    with refuses(problem):
+        score(**changes)
 
 
-def test_wrong_evaluation_arguments_are_named() -> None:
-    for changes, problem in WRONG:
-        with refuses(problem):
-            score(**changes)
-    with refuses("policy: expected a function"):
-        evaluate(None, name="mine", **{**WORLDS, **SCALE})
-
-
-def test_some_figures_need_no_hidden_states(tmp_path: Path) -> None:
-    settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
-    whole, of_truth = score(), ("burning_seen_share", "front_distance")
-    for flags in ({}, {"publish_truth": True, "reveal_model": False}):
-        running = server(worlds=4, **settings, **flags)
-        keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
-        csv = tmp_path / f"{len(flags)}.csv"
-        rows = evaluate(walk(0), name="mine", csv=csv, **keywords)
-        for row, other in zip(rows, whole, strict=True):
-            assert [getattr(row, value) for value in of_truth] == [None, None]
-            for value in {*MERIT, "worlds_fingerprint"} - {*of_truth}:
-                assert getattr(row, value) == getattr(other, value), value
-        assert read(csv) == rows
-
-
-def test_worlds_that_do_not_fit_an_evaluation_are_refused(states: Path) -> None:
-    keywords = {**SCALE, "n_moves": 6, "states": states, "observation": "frame", "seeds": [0, 1]}
-    with refuses("steps: expected at most 12, .*, got 13"):
-        evaluate(walk(0), name="mine", **(keywords | {"steps": 13}))
-    running = server(worlds=1, robots=4, height=7, width=9, moves=6, model=LIVELY, burn_in=60)
+@pytest.mark.parametrize("flags", [{}, {"publish_truth": True, "reveal_model": False}], ids=str)
+def test_some_figures_need_no_hidden_states(flags: dict[str, Any], tmp_path: Path) -> None:
+    running = server(worlds=4, **FLAGS, **flags)
     keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
-    with refuses("robots: expected the server.s 4"):
-        evaluate(walk(0), name="mine", **keywords)
+    rows = evaluate(walk(), name="mine", csv=tmp_path / "mine.csv", **keywords)
+    of_truth = ("burning_seen_share", "front_distance")
+    assert {getattr(row, name) for row in rows for name in of_truth} == {None}
+    assert [figures(it, *of_truth) for it in rows] == [figures(it, *of_truth) for it in score()]
+    assert read(tmp_path / "mine.csv") == rows
+
+
+def test_episodes_that_are_too_short_are_refused(states: Path) -> None:
+    with refuses("steps: expected at most 12, .*, got 13"):
+        evaluate(walk(), name="mine", n_moves=4, states=states, observation="frame", steps=13)

@@ -6,21 +6,14 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, cast
 
 from emberwatch.benchmark.evaluation import evaluate
 from emberwatch.benchmark.policies import Policy
-from emberwatch.benchmark.row_file import check_writable
-from emberwatch.benchmark.rows import Row
-from emberwatch.common.arguments import as_integer, repr_of
-from emberwatch.errors import ExistingFileError, InvalidArgumentError, invalid
+from emberwatch.benchmark.rows import Row, check_writable
+from emberwatch.common.arguments import as_count, repr_of
+from emberwatch.errors import ExistingFileError, invalid
 from emberwatch.model.tasks import Task, built_in_tasks
-
-#: Keywords of `evaluate` that a suite sets itself.
-_SET: Final = ("task", "seeds", "steps", "csv", "append")
-
-#: Names that are safe as a file's name, once `/` and `+` are replaced.
-_NAME: Final = re.compile(r"[A-Za-z0-9_./+-]{1,64}")
 
 
 def suite(
@@ -47,40 +40,38 @@ def suite(
     Returns:
         The rows of each task, one for each world, by the task's name.
     """
-    for keyword in _SET:
-        if keyword in keywords:
-            raise InvalidArgumentError(f"{keyword}: suite sets it; leave it out")
-    if not isinstance(name, str) or not _NAME.fullmatch(name):  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_./+-]{1,64}", name):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise invalid("name", "1 to 64 letters, digits and -_./+", repr_of(name))
-    if worlds is not None and (as_integer(worlds) or 0) < 1:
-        raise invalid("worlds", "at least 1", repr_of(worlds))
-    by_task = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
-    sources = list(by_task or built_in_tasks() if tasks is None else tasks)
+    if worlds is not None:
+        as_count(worlds, "worlds", 1, 2**32 - 1)
+    policies = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
+    sources = list(policies or built_in_tasks() if tasks is None else tasks)
     if not sources:
         raise invalid("tasks", "at least one task", "none")
     chosen = [(source, Task.named(source)) for source in sources]
     names = [task.name for _, task in chosen]
     if len(set(names)) < len(names):
         raise invalid("tasks", "tasks with different names", ", ".join(names))
-    for task_name in names:
-        if by_task is not None and task_name not in by_task:
-            raise invalid("policy", f"one for the task {task_name}", ", ".join(by_task))
-    stem = name.replace("/", "_").replace("+", "_")
-    files = {task_name: Path(folder) / task_name / f"{stem}.csv" for task_name in names}
-    for file in files.values():
-        if os.path.lexists(file):
+    files: dict[str, Path] = {}
+    for task in names:
+        if policies is not None and task not in policies:
+            raise invalid("policy", f"one for the task {task}", ", ".join(policies))
+        files[task] = Path(folder, task, re.sub("[/+]", "_", name) + ".csv")
+        if os.path.lexists(files[task]):
             raise ExistingFileError(
-                f"folder: {file} already exists: remove it, choose another name or folder, or "
-                "leave its task out with tasks="
+                f"folder: {files[task]} already exists: remove it, choose another name or folder, "
+                "or leave its task out with tasks="
             )
-        check_writable(file)
+        check_writable(files[task])
     return {
         task.name: evaluate(
-            cast("Any", policy) if by_task is None else by_task[task.name],
+            cast("Any", policy) if policies is None else policies[task.name],
             name=name,
             task=source,
             seeds=task.test_seeds[:worlds],
+            steps=task.max_steps,
             csv=files[task.name],
+            append=False,
             **keywords,
         )
         for source, task in chosen

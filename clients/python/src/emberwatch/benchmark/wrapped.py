@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -24,24 +24,16 @@ class Wrapped:
     """Worlds whose observations pass through wrappers. The wrappers never see an episode end."""
 
     def __init__(self, worlds: Any, wrap: Callable[[VecEnv], VecEnv]) -> None:
-        """Wraps the worlds, and freezes the statistics of each `VecNormalize`.
-
-        Raises:
-            InvalidArgumentError: If `wrap` does not return wrappers of its argument, or a
-                `VecNormalize` has no statistics.
-        """
+        """Wraps the worlds, and freezes the statistics of each `VecNormalize`."""
         self._base = _ScoredVecEnv(worlds)
         self._vector: Any = wrap(self._base)
-        #: Whether one of the wrappers is a `VecNormalize`.
-        self.is_normalized = False
         layer: Any = self._vector
         while layer is not self._base:
             if not isinstance(layer, VecEnvWrapper):
                 expected = "a function that returns its argument in VecEnvWrappers of SB3"
                 raise invalid("wrap", expected, repr_of(self._vector))
             if isinstance(layer, VecNormalize):
-                self.is_normalized = True
-                _fix(layer)
+                _freeze(layer)
             layer = layer.venv
         self.single_observation_space = self._vector.observation_space
 
@@ -69,9 +61,9 @@ class _ScoredVecEnv(WildfireVecEnv):
         space = deepcopy(worlds.single_observation_space)
         VecEnv.__init__(self, worlds.num_envs, space, worlds.single_action_space)
 
-    def choose(self, seeds: Sequence[int]) -> None:
+    def choose(self, seeds: list[int]) -> None:
         """Sets the seeds of the next reset."""
-        self._seeds = list(seeds)
+        self._seeds = seeds
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         seen, rewards, _, self.truncated, _ = self._env.step(self._actions)
@@ -79,13 +71,12 @@ class _ScoredVecEnv(WildfireVecEnv):
         return seen, rewards.astype(np.float32), none, [{} for _ in range(self.num_envs)]
 
 
-def _fix(normalize: VecNormalize) -> None:
+def _freeze(normalize: VecNormalize) -> None:
     """Freezes the statistics of the training; refuses a `VecNormalize` without statistics."""
     normalize.training = normalize.norm_reward = False
     rms = normalize.obs_rms if normalize.norm_obs else {}
-    parts = rms.values() if isinstance(rms, dict) else [rms]
     # The count of a new `VecNormalize` is far below 1.
-    if any(part.count < 1.0 for part in parts):
+    if any(part.count < 1.0 for part in (rms.values() if isinstance(rms, dict) else [rms])):
         raise InvalidArgumentError(
             "wrap: VecNormalize has no statistics: save the training's statistics with its `save`, "
             "and pass wrap=lambda worlds: VecNormalize.load('statistics.pkl', worlds)"
