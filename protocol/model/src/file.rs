@@ -224,7 +224,7 @@ impl From<toml::de::Error> for ModelError {
             .iter()
             .any(|key| error.message().contains(key))
         {
-            text += "`rings` and `pays` are gone, remove both: a sensor has one observation matrix, and rewards are for \
+            text += "remove `rings` and `pays`: a sensor has one observation matrix, and rewards are for \
                      visited cells\n";
         }
         Self::Toml(text)

@@ -82,8 +82,8 @@ zone_map = [[0, 1, 1]] =>  => zone_map: expected the zone of each cell, got none
 [[0, 0, 1]] => [[0, 0, 2]] => no_fly: expected 0 or 1 for each cell, got 2
 [[0, 0, 1]] => [[1, 1, 1]] => no_fly: expected a cell where robots may be, got none
 radius = 3 => radius = 9 => sensor: radius: expected 0 to 8 cells, got 9
-radius = 3 => rings = [] => remove `rings`: a sensor has one observation matrix
-radius = 3 => pays = "visited" => remove `pays`: a sensor has one observation matrix
+radius = 3 => rings = [] => remove `rings` and `pays`: a sensor has one observation matrix
+radius = 3 => pays = "visited" => remove `rings` and `pays`: a sensor has one observation matrix
 "##;
 
 #[test]
