@@ -1,4 +1,4 @@
-//! Markdown tables, such as those of a comparison, with one row per group.
+//! Markdown tables of comparisons, suites and the leaderboard.
 
 use crate::benchmark::report::number::{NOTHING, number, signed, with_error};
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};

@@ -46,7 +46,7 @@ pub struct About {
     pub training_seconds: Option<f64>,
 }
 
-/// The columns of an entry's file; the first are those of [`About`].
+/// The columns of an entry's file. It begins with the columns of [`About`].
 const COLUMNS: &str = "policy,by,code,commit,training_seconds,estimator,task,world_seed,steps,robots,team,mean_reward,\
                        brier,log_likelihood,worlds_fingerprint";
 
@@ -241,8 +241,8 @@ pub fn all_runs(entries: &[Entry]) -> Vec<PolicyRun> {
 /// Lists the kinds of team in which runs were flown.
 fn teams<'a>(runs: impl Iterator<Item = &'a PolicyRun>) -> String {
     let teams: BTreeSet<&str> = runs.map(|run| &*run.team).collect();
-    match teams.is_empty() {
-        true => NOTHING.into(),
-        false => Vec::from_iter(teams).join(", "),
+    if teams.is_empty() {
+        return NOTHING.into();
     }
+    Vec::from_iter(teams).join(", ")
 }

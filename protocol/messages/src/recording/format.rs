@@ -148,13 +148,6 @@ pub enum RecordingError {
     Refused(String),
 }
 
-impl RecordingError {
-    /// Returns whether the records before the error are complete and can be used.
-    pub fn leaves_good_records(&self) -> bool {
-        matches!(self, Self::Cut { .. } | Self::Damaged { .. })
-    }
-}
-
 /// Returns the checksum of a record.
 pub(super) fn checksum(header: &RecordHeader, stored: &[u8]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();

@@ -56,10 +56,10 @@ def evaluate(
 
     Args:
         policy: A function from stacked observations of several worlds to their actions, or an
-            object with the `predict` of Stable-Baselines3's models. It receives those of the
-            arguments `state` (which it last returned), `episode_start` (true in the first step),
-            `deterministic` and `action_masks` (`(n_worlds, 4)` booleans) that it has parameters
-            for. A `VecNormalize` that a model refers to normalizes its observations. A method
+            object with the `predict` of Stable-Baselines3's models. If it has parameters with
+            these names, it receives `state` (which it last returned), `episode_start` (true in the
+            first step), `deterministic` and `action_masks` (`(n_worlds, 4)` booleans). A
+            `VecNormalize` that a model refers to normalizes its observations. A method
             `begin(n_worlds)`, if there is one, is called before each batch of worlds.
         name: The policy's name in the table.
         seeds: The seeds of the worlds; None: the test seeds of the task, or 0 to 7. Seeds below
