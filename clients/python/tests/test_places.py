@@ -1,16 +1,20 @@
 """Where a client connects: instance names, waiting for servers, the lock."""
 
 import fcntl
+import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import ModuleType
 
 import pytest
 from failures import fails
 from processes import CHANNELS, PATIENCE, ctrl_c, eventually, server, unused_instance
 
-from emberwatch import errors
+from emberwatch import _native, errors
 from emberwatch.client.client import connect
 
 US = os.getpid()
@@ -62,3 +66,26 @@ def test_a_stopped_lock_holder_blocks_nobody() -> None:
             assert holder.poll() is None
         finally:
             holder.kill()
+
+
+def another_copy(folder: Path) -> ModuleType:
+    """Loads a second copy of the native module, as a plugin with its own copy does."""
+    copy = shutil.copy(_native.__file__, folder)
+    spec = importlib.util.spec_from_file_location("emberwatch._native", copy)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_second_copy_of_the_library_is_refused_while_the_first_is_connected(
+    tmp_path: Path,
+) -> None:
+    started = server()
+    copy = another_copy(tmp_path)
+    with started.connect() as client:
+        lease = client.acquire()
+        for opens, *rest in ((copy.Server, "copy", PATIENCE), (copy.Frames,), (copy.Truths,)):
+            with fails("channel", match="one copy of Emberwatch's library in this process"):
+                opens(started.instance, *rest)
+            lease.step([3] * 6)

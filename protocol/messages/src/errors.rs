@@ -108,6 +108,12 @@ pub enum ChannelError {
     /// The check set with [`crate::interrupt::interrupt_when`] ended a wait.
     #[error("interrupted")]
     Interrupted,
+    /// Another copy of this library has channels in this process.
+    #[error(
+        "channels: expected one copy of Emberwatch's library in this process, found another one with open channels: \
+         close them first, or use one process for each copy"
+    )]
+    AnotherCopy,
     /// iceoryx2 returned an error.
     #[error("{what}: iceoryx2 reports {problem}")]
     Ipc {

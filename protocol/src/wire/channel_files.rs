@@ -7,11 +7,11 @@
 use super::directory::{SHARED_MEMORY, channel_directory, prefix};
 use super::ipc::Ipc;
 use super::own_nodes;
-use super::process::{if_there, node_pid, process_state};
+use super::process::{if_there, lock_holder, node_pid, process_state};
 use emberwatch_messages::message::VERSION;
 use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
-use rustix::process::{Flock, FlockType, Pid, fcntl_getlk};
+use rustix::process::{Flock, FlockType, Pid, fcntl_getlk, getpid};
 use rustix::time::{ClockId, clock_gettime};
 use std::collections::HashSet;
 use std::fs::{File, Metadata};
@@ -138,6 +138,22 @@ impl ChannelFiles {
         let monitor = name.strip_prefix(&self.prefix);
         let monitor = monitor.and_then(|name| name.split_once(".node_monitor"));
         monitor.map_or(&*name, |(id, _)| id).parse().ok()
+    }
+
+    /// Returns whether another copy of this library has a node in this process, such as a plugin's copy. iceoryx2 marks
+    /// living nodes with locks of `fcntl`, which belong to the process: closing such a file releases the lock.
+    pub(super) fn has_another_copy(&self) -> Result<bool, Error> {
+        let own_pid = getpid().as_raw_nonzero().get();
+        for path in entries(&self.root.join("nodes"))? {
+            let node = self.node(&path);
+            if node.is_some_and(|id| node_pid(id) == own_pid && !own_nodes::has(id))
+                && let Some(found) = metadata(&path)?
+                && lock_holder("POSIX", found.dev(), found.ino()) == Some(own_pid)
+            {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
 
     pub(super) fn segments(&self) -> Result<Vec<PathBuf>, Error> {

@@ -1,5 +1,6 @@
 //! The iceoryx2 node of a process.
 
+use super::channel_files::ChannelFiles;
 use super::cleanup::make_way;
 use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, not_usable, prefix};
 use super::ipc::Ipc;
@@ -25,6 +26,7 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     let config = node_config()?;
     check_room_for_ports(0)?;
     let _turn = Turn::take()?;
+    check_only_copy(&ChannelFiles::of_user())?;
     make_way()?;
     own_segments(shared_memory, &prefix())?;
     let node = NodeBuilder::new()
@@ -85,6 +87,16 @@ impl<T> Drop for Opened<T> {
     }
 }
 
+/// Checks that no other copy of this library has a node in this process. The cleanup of this copy would release the
+/// lock of that node, and take it for dead.
+fn check_only_copy(files: &ChannelFiles) -> Result<(), ChannelError> {
+    let unread = |error| not_usable(&files.root, error);
+    if files.has_another_copy().map_err(unread)? {
+        return Err(ChannelError::AnotherCopy);
+    }
+    Ok(())
+}
+
 /// Checks that shared memory with this prefix belongs to this user, and revokes the access of all other users.
 fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelError> {
     let entries = std::fs::read_dir(folder).map_err(|error| not_usable(folder, error))?;
@@ -119,6 +131,35 @@ fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelErr
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rustix::fs::{FlockOperation, fcntl_lock};
+    use std::fs::File;
+
+    #[test]
+    fn a_node_of_another_copy_is_refused_until_it_is_closed() {
+        let root = std::env::temp_dir().join(format!("emberwatch-copies-{}", std::process::id()));
+        let nodes = root.join("nodes");
+        std::fs::create_dir_all(&nodes).expect("a new directory");
+        let files = ChannelFiles {
+            shared: root.clone(),
+            root,
+            prefix: "emberwatch_1_".into(),
+        };
+        let lock = |pid: u32| {
+            let monitor = format!("emberwatch_1_{}.node_monitor", (u128::from(pid) << 64) + 77);
+            let file = File::create(nodes.join(monitor)).expect("a file");
+            fcntl_lock(&file, FlockOperation::LockExclusive).expect("a free file");
+            file
+        };
+        let elsewhere = lock(std::process::id() + 1);
+        check_only_copy(&files).expect("a node whose id has another process");
+        let another = lock(std::process::id());
+        let refusal = check_only_copy(&files).expect_err("a copy has a node");
+        assert!(matches!(refusal, ChannelError::AnotherCopy), "{refusal}");
+        drop(another);
+        check_only_copy(&files).expect("the node of a process that ended has no lock");
+        drop(elsewhere);
+        std::fs::remove_dir_all(&files.root).expect("clean up");
+    }
 
     #[test]
     fn shared_memory_with_the_prefix_is_closed_to_other_users() {

@@ -3,6 +3,7 @@
 use super::poll::is_readable;
 use super::resources::call_error;
 use emberwatch_messages::errors::ChannelError;
+use rustix::fs::{major, minor};
 use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, getpid, pidfd_open};
 use std::io::{Error, ErrorKind};
@@ -92,6 +93,22 @@ pub(crate) fn process_state(pid: i32) -> Result<Option<char>, Error> {
     let stat = if_there(std::fs::read_to_string(format!("/proc/{pid}/stat")))?;
     // The state follows the name, which is in brackets and may itself contain brackets.
     Ok(stat.and_then(|stat| stat.rsplit_once(") ")?.1.chars().next()))
+}
+
+/// Returns the process that has a lock for writing on a file, from `/proc/locks`. `kind` is `FLOCK`, or `POSIX` for a
+/// lock of `fcntl`.
+pub(super) fn lock_holder(kind: &str, device: u64, inode: u64) -> Option<i32> {
+    let (major, minor) = (major(device), minor(device));
+    let file = format!("{major:02x}:{minor:02x}:{inode}");
+    let locks = std::fs::read_to_string("/proc/locks").ok()?;
+    // "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; a line of a waiting process begins with an arrow.
+    locks.lines().find_map(|line| {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match words[..] {
+            [_, found, _, "WRITE", pid, of, ..] if found == kind && of == file => pid.parse().ok(),
+            _ => None,
+        }
+    })
 }
 
 /// Returns the result of reading a file, or `None` if the file does not exist. Other errors are returned, because they

@@ -5,11 +5,11 @@
 //! `flock`, which ends with its process.
 
 use super::directory::{not_usable, own_channel_directory};
-use super::process::process_state;
+use super::process::{lock_holder, process_state};
 use super::resources::call_error;
 use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::interrupt::check_interrupt;
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, major, minor, open, stat};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open, stat};
 use rustix::io::Errno;
 use std::cell::Cell;
 use std::os::fd::OwnedFd;
@@ -190,20 +190,10 @@ fn is_file(file: &OwnedFd, path: &Path) -> bool {
     }
 }
 
-/// Returns the process that has the lock, from `/proc/locks`.
+/// Returns the process that has the lock.
 fn holder(file: &OwnedFd) -> Option<i32> {
     let found = fstat(file).ok()?;
-    let (major, minor) = (major(found.st_dev), minor(found.st_dev));
-    let inode = format!("{major:02x}:{minor:02x}:{}", found.st_ino);
-    let locks = std::fs::read_to_string("/proc/locks").ok()?;
-    // "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; a line of a waiting process begins with an arrow.
-    locks.lines().find_map(|line| {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        match words[..] {
-            [_, "FLOCK", _, "WRITE", pid, found, ..] if found == inode => pid.parse().ok(),
-            _ => None,
-        }
-    })
+    lock_holder("FLOCK", found.st_dev, found.st_ino)
 }
 
 fn is_stopped(pid: i32) -> bool {
