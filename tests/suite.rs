@@ -219,6 +219,27 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
 }
 
 #[test]
+fn a_training_is_refused_if_the_task_file_has_changed_since_the_command_began() {
+    let place = Place::new();
+    let [task, runs, server] = ["tiny.toml", "runs", "server"].map(|name| place.0.word(name));
+    // The first server only checks the task; the training starts the second one.
+    let script = format!(
+        "#!/bin/sh\nif [ -e {server}.once ]; then sed -i 's/burn_in = 300/burn_in = 301/' {task}; fi\n\
+         touch {server}.once\nexec {} \"$@\"\n",
+        program_path(SERVER).display()
+    );
+    place.0.write("server", &script);
+    let executable = PermissionsExt::from_mode(0o700);
+    std::fs::set_permissions(place.0.path("server"), executable).expect("chmod");
+    let flags = format!(
+        "--policies learned_beam --checkpoints {runs} --train --train-steps 64 --server {server}"
+    );
+    let words = "learned_beam is not run: train --learner filter: the task's files have changed since the command began";
+    check(AGENT, &place.words(&flags), words);
+    assert!(!place.0.path("runs/tiny/filter").exists());
+}
+
+#[test]
 fn wrong_suites_and_entries_are_named_before_anything_runs() {
     let place = Place::new();
     let table = "suite --tasks ash => task ash: No such file | expected a file, or one of wildfire, small

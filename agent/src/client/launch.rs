@@ -24,6 +24,7 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(3);
 /// A server that this process started. Dropping it stops the server.
 pub struct OwnServer {
     instance: Instance,
+    worlds_fingerprint: String,
     program: OwnProgram,
 }
 
@@ -48,13 +49,22 @@ impl OwnServer {
             .args(["--instance", instance.name()])
             .args(arguments);
         let program = OwnProgram::start(&mut command)?;
-        let mut server = Self { instance, program };
+        let mut server = Self {
+            instance,
+            worlds_fingerprint: String::new(),
+            program,
+        };
         server.wait_until_it_answers()?;
         Ok(server)
     }
 
     pub fn instance(&self) -> &Instance {
         &self.instance
+    }
+
+    /// Returns the digits that identify the server's worlds, apart from their seeds.
+    pub fn worlds_fingerprint(&self) -> &str {
+        &self.worlds_fingerprint
     }
 
     /// Returns a digest of two running programs, this one and the server. A program that is built anew from changed
@@ -84,6 +94,8 @@ impl OwnServer {
                         pid == expected,
                         "instance {instance}: expected the server that was started, pid {expected}, got pid {pid}"
                     );
+                    let fingerprint = connection.info().worlds_fingerprint.clone();
+                    self.worlds_fingerprint = fingerprint.unwrap_or_default();
                     return Ok(());
                 }
                 Err(error) if Instant::now() > deadline => return Err(error.into()),

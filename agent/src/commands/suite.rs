@@ -236,6 +236,7 @@ impl SuiteCommand {
         let trainings = Trainings {
             folder: folder.join(&plan.task.name),
             task: plan.task,
+            worlds_fingerprint: &plan.worlds[0].2,
             policy,
             config: &plan.comparison.config,
             steps: self.train_steps,

@@ -26,6 +26,8 @@ pub struct Trainings<'a> {
     /// The task's folder.
     pub folder: PathBuf,
     pub task: &'a Task,
+    /// Identifies the worlds that the task's files defined when the command began.
+    pub worlds_fingerprint: &'a str,
     pub policy: &'a Policy,
     pub config: &'a AgentConfig,
     /// World steps of each training, summed over its worlds; `None`: the number in the settings.
@@ -44,8 +46,8 @@ impl Trainings<'_> {
     /// Reads the checkpoints. If `trains`, first runs the trainings that have none.
     ///
     /// # Errors
-    /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, or if a
-    /// learner cannot learn in the task's worlds.
+    /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, if a
+    /// learner cannot learn in the task's worlds, or if the task's files have changed.
     pub fn complete(&self, trains: bool, world: &WorldForm) -> Result<Trained> {
         let (mut folders, mut seconds) = (Vec::new(), Some(0.0));
         let all: Vec<(&str, PathBuf)> = self.folders().collect();
@@ -110,7 +112,6 @@ impl Trainings<'_> {
             config,
             learned,
         };
-        make_folder(&spec.out)?;
         let (worlds, seed) = (
             spec.worlds.len().to_string(),
             FIRST_TRAINING_SEED.to_string(),
@@ -124,6 +125,11 @@ impl Trainings<'_> {
             &seed,
         ];
         let server = start_server(self.server.clone(), flags.map(String::from).into(), &spec)?;
+        ensure!(
+            server.worlds_fingerprint() == self.worlds_fingerprint,
+            "the task's files have changed since the command began: run it again"
+        );
+        make_folder(&spec.out)?;
         learn(server.instance(), &spec, None, &AtomicBool::new(false))?;
         rename(&spec.out, folder).with_context(|| format!("rename to {}", folder.display()))
     }
