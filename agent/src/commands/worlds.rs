@@ -99,24 +99,25 @@ impl WorldFlags {
         n_robots: Option<u32>,
         check: impl Fn(&Model) -> Result<()>,
     ) -> Result<Worlds> {
-        let (instance, own) = match &self.instance {
+        let (instance, own, model) = match &self.instance {
             Some(name) => {
                 let instance = Instance::new(name)?;
                 self.wait.for_server(&instance, || false)?;
-                (instance, None)
+                (instance, None, None)
             }
             None => {
-                self.grid.check()?.as_ref().map_or(Ok(()), check)?;
+                let model = self.grid.check()?;
+                model.as_ref().map_or(Ok(()), check)?;
                 let mut arguments = self.server_arguments();
                 if self.grid.task.is_none() {
                     arguments.extend(robot_arguments(n_robots.unwrap_or(1)));
                 }
                 let server = OwnServer::start(self.server.clone(), &arguments)?;
-                (server.instance().clone(), Some(server))
+                (server.instance().clone(), Some(server), model)
             }
         };
         let mut arena = Arena::open(&instance, self.n_seeds())?;
-        if let Some(model) = self.grid.model_of_states()? {
+        if let Some(model) = model.filter(|_| self.grid.states.is_some()) {
             arena.know(model)?;
         }
         let got = arena.info().burn_in;
