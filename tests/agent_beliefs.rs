@@ -120,7 +120,7 @@ fn a_training_shows_what_it_believes_of_all_its_worlds() {
     for AgentBelief { belief, intent, .. } in &shown {
         assert_eq!(belief.dim(), (3, 16, 24));
         assert_eq!(intent.policy, "train filter");
-        assert_eq!(intent.belief_from, "learned_filter");
+        assert_eq!(intent.belief_from, "learned");
         assert_eq!(intent.states, ["state 0", "state 1", "state 2"]);
         assert_eq!(intent.objective, "random moves");
     }

@@ -95,22 +95,22 @@ fn decisions_are_learned_and_enter_the_ladder_beside_their_filter() {
 #[test]
 fn a_training_that_ended_in_its_filter_resumes_there() {
     let place = place();
-    let first = format!("{WORLDS} --estimator learned_spatial_filter --kernels own");
+    let first = format!("{WORLDS} --estimator learned+spatial --kernels own");
     let words = "the time ended before the belief was learned: continue with --resume";
     place.refuse("out", &format!("{first} --time-limit 0"), words);
     assert!(!place.checkpoint("out").exists());
     let resume = format!("{WORLDS} --resume --steps 20");
-    let other = "=> --estimator: expected learned_spatial_filter as in the checkpoint, got";
+    let other = "=> --estimator: expected learned+spatial as in the checkpoint, got";
     place.refuse_all(
         "out",
         &resume,
         &format!(
             "--freeze => --freeze: expected a checkpoint of decisions
---estimator known_model {other}"
+--estimator known {other}"
         ),
     );
     place.train("out", &format!("{resume} --time-limit 1e19"));
-    let expected = (KernelKind::Own, "learned_spatial_filter".to_owned());
+    let expected = (KernelKind::Own, "learned+spatial".to_owned());
     assert_eq!(saved(&place, "out"), expected);
     // The checkpoint now contains decisions, from which a training can resume.
     let filter = place.flag("out/belief");
@@ -125,7 +125,7 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
         "out",
         &resume,
         &format!(
-            "--estimator learned_filter {other}
+            "--estimator learned {other}
 {filter} => --checkpoint cannot be combined with --resume
 {model} => checkpoint: expected the world's 4 observations, got 3"
         ),
@@ -138,17 +138,17 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
     place.refuse_all(
         "given",
         &format!("{given} {filter}"),
-        "--estimator known_model => --checkpoint | known_model
+        "--estimator known => --checkpoint | known
 --learner filter => --checkpoint applies only with --learner decisions",
     );
-    let spatial = "--estimator learned_spatial_filter";
+    let spatial = "--estimator learned+spatial";
     place.train("given", &format!("{given} {filter} {spatial}"));
     assert!(!place.folder.path("given/belief").exists());
     place.refuse_all(
         "hidden",
         &given,
-        "--learner filter --estimator known_model => --estimator applies only with
---estimator known_model => --reveal-model true
+        "--learner filter --estimator known => --estimator applies only with
+--estimator known => --reveal-model true
 --estimator filter => --estimator | got",
     );
 }
@@ -157,11 +157,11 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
 fn decisions_on_a_known_model_go_on_with_it() {
     let place = place();
     for out in ["out", "same"] {
-        place.train(out, &format!("{WORLDS} --estimator known_model --steps 20"));
+        place.train(out, &format!("{WORLDS} --estimator known --steps 20"));
         place.train(out, &format!("{WORLDS} --resume --steps 10"));
     }
     assert_eq!(steps(&place, "out"), "30");
-    assert_eq!(saved(&place, "out").1, "known_model");
+    assert_eq!(saved(&place, "out").1, "known");
     let is_same = place.bytes("out") == place.bytes("same");
     assert!(is_same, "checkpoints of the same training differ");
 }

@@ -67,10 +67,10 @@ fn a_neural_belief_corrects_a_filter_and_decisions_learn_on_it() {
     place.refuse(
         "other",
         &wrong,
-        "--checkpoint | for the estimator learned_filter",
+        "--checkpoint | for the estimator learned",
     );
 
-    let flags = format!("{WORLDS} --learner decisions --estimator neural_belief");
+    let flags = format!("{WORLDS} --learner decisions --estimator neural");
     place.train("decisions", &format!("{flags} --steps 10"));
     assert!(place.checkpoint("decisions/belief").exists());
     place.train(

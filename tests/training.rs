@@ -48,7 +48,7 @@ fn a_training_that_made_no_update_says_why() {
             "6 world steps: an update needs 4 blocks of frames (learning.streams), and there were 2",
         ),
         (
-            "--learner decisions --estimator known_model --steps 14",
+            "--learner decisions --estimator known --steps 14",
             "14 world steps: an update learns from 9 transitions, and the steps yielded 6",
         ),
         (
@@ -266,7 +266,7 @@ fn a_checkpoint_is_compared_and_checked() {
     place.train("own", &resume);
     for learner in [
         "neural",
-        "decisions --estimator known_model",
+        "decisions --estimator known",
         "decisions --resume",
     ] {
         let flags = format!("{WORLDS} --learner {learner} --kernels own");

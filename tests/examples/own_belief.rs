@@ -36,7 +36,6 @@ struct LastSeen {
 /// The description and the constructor of this estimator, for a policy.
 const LAST_SEEN: BeliefKind = BeliefKind {
     name: "last_seen",
-    label: "last_seen",
     about: "the last observation of each cell, less certain with each step",
     input: Input::Frames,
     knows_model: true,

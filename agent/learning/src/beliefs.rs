@@ -40,10 +40,9 @@ pub const BELIEFS: &[&BeliefKind] = &[
     &TRUTH,
 ];
 
-/// Finds a kind by its name or its label.
+/// Finds a kind by its name.
 pub fn named(name: &str) -> Option<&'static BeliefKind> {
-    let mut kinds = BELIEFS.iter().copied();
-    kinds.find(|kind| kind.name == name || kind.label == name)
+    BELIEFS.iter().copied().find(|kind| kind.name == name)
 }
 
 /// Finds a kind like [`named`], but only among the kinds of belief on which a DQN can learn to choose options.
@@ -52,7 +51,7 @@ pub fn named(name: &str) -> Option<&'static BeliefKind> {
 /// already learns which objective to plan for are excluded.
 ///
 /// # Errors
-/// If there is no such kind. The error lists the labels of all valid kinds.
+/// If there is no such kind. The error lists the names of all valid kinds.
 pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
     let serves = |kind: &&BeliefKind| {
         let has_one_source = !kind.knows_model || kind.learned_by.is_none();
@@ -60,7 +59,7 @@ pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
     };
     named(name).filter(serves).ok_or_else(|| {
         let kinds = BELIEFS.iter().copied().filter(serves);
-        let names: Vec<&str> = kinds.map(|kind| kind.label).collect();
+        let names: Vec<&str> = kinds.map(|kind| kind.name).collect();
         format!("expected one of {}, got {name:?}", names.join(", "))
     })
 }
@@ -70,31 +69,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_name_label_and_text_identifies_one_kind() {
+    fn each_name_and_text_identifies_one_kind() {
         for &kind in BELIEFS {
             assert_eq!(named(kind.name), Some(kind));
-            assert_eq!(named(kind.label), Some(kind));
-            let others = BELIEFS.iter().filter(|other| **other != kind);
-            for other in others {
-                assert!(![other.name, other.label].contains(&kind.name), "{kind:?}");
-                assert_ne!(other.label, kind.label);
-                assert_ne!(other.about, kind.about);
-            }
+            let same = BELIEFS.iter().filter(|it| it.name == kind.name || it.about == kind.about);
+            assert_eq!(same.count(), 1, "{kind:?}");
         }
     }
 
     #[test]
     fn options_are_learned_on_beliefs_that_frames_correct() {
-        let labels = [
-            "known_model, spatial_filter, second_order_filter, cavity_filter",
-            "spatial_cavity_filter, learned_filter, learned_spatial_filter",
-            "learned_cavity_filter, learned_spatial_cavity_filter, neural_belief",
+        let names = [
+            "known, known+spatial, known+second-order, known+cavities, known+spatial+cavities",
+            "learned, learned+spatial, learned+cavities, learned+spatial+cavities, neural",
         ]
         .join(", ");
         let error = of_options("filter").expect_err("no name");
-        assert_eq!(error, format!("expected one of {labels}, got \"filter\""));
-        for label in labels.split(", ") {
-            assert_eq!(of_options(label).map(|kind| kind.label), Ok(label));
+        assert_eq!(error, format!("expected one of {names}, got \"filter\""));
+        for name in names.split(", ") {
+            assert_eq!(of_options(name).map(|kind| kind.name), Ok(name));
         }
         assert!(of_options("truth").is_err());
     }

@@ -60,7 +60,7 @@ impl Crew {
         ensure!(
             learned.get::<AutoencoderModel>().is_none(),
             "checkpoint: expected a belief that options can be planned on, such as {}, got an autoencoder",
-            KNOWN.label
+            KNOWN.name
         );
         kind.learned(&learned).context("checkpoint")?;
         kind.check(&learned, &WorldForm::of(&model, shape))?;

@@ -104,7 +104,7 @@ impl WorldRun {
         let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
         PolicyRun {
             policy: policy.name.clone(),
-            estimator: policy.belief.label.into(),
+            estimator: policy.belief.name.into(),
             world_seed: self.seed,
             steps,
             mean_reward: mean(self.reward),

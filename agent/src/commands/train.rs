@@ -61,7 +61,7 @@ pub struct TrainCommand {
     /// the remaining steps of the settings]
     #[arg(long)]
     steps: Option<u64>,
-    /// Estimator whose belief decisions are learned on [default: learned_filter; with --resume: the checkpoint's]
+    /// Estimator whose belief decisions are learned on [default: learned; with --resume: the checkpoint's]
     #[arg(long, value_name = "NAME", value_parser = beliefs::of_options)]
     estimator: Option<&'static BeliefKind>,
     /// Checkpoint of the --estimator from an earlier training; without it, a learned estimator is trained first. With
@@ -136,7 +136,7 @@ impl TrainCommand {
             config.kernels = kernels;
         }
         if let Some(estimator) = self.estimator {
-            config.decisions.estimator = estimator.label.into();
+            config.decisions.estimator = estimator.name.into();
         }
         let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
         if let Some(full_frames) = self.full_frames {
@@ -213,7 +213,7 @@ impl TrainCommand {
                 matches!(belief.learned(&learned), Ok(Some(_))),
                 "--checkpoint {}: expected a checkpoint for the estimator {}, got one of another kind",
                 path.display(),
-                belief.label
+                belief.name
             );
         }
         Ok(learned)
@@ -284,11 +284,11 @@ impl TrainCommand {
         ensure!(
             got == expected,
             "--estimator: expected {} as in the checkpoint, got {}",
-            expected.label,
-            got.label
+            expected.name,
+            got.name
         );
         self.check_no_checkpoint()?;
-        training.config.decisions.estimator = expected.label.into();
+        training.config.decisions.estimator = expected.name.into();
         Ok(())
     }
 

@@ -78,7 +78,7 @@ impl Trainings<'_> {
         let belief = self.policy.belief;
         let by = belief.learned_by.as_ref();
         let by = by.map(|by| (by.learner, self.folder.join(by.learner)));
-        let decisions = format!("{}-{}", DECISIONS.name, belief.label);
+        let decisions = format!("{}-{}", DECISIONS.name, belief.name);
         let decisions = (DECISIONS.name, self.folder.join(decisions));
         let decisions = self.policy.chooses_options().then_some(decisions);
         by.into_iter().chain(decisions)
@@ -89,7 +89,7 @@ impl Trainings<'_> {
         let mut config = self.config.clone();
         config.learner = learner.into();
         if learner == DECISIONS.name {
-            config.decisions.estimator = self.policy.belief.label.into();
+            config.decisions.estimator = self.policy.belief.name.into();
         }
         let kind = learners::named(learner).map_err(anyhow::Error::msg)?;
         let steps = self.steps.unwrap_or(match (kind.steps)(&config) {

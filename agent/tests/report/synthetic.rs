@@ -6,11 +6,11 @@ use emberwatch_agent::benchmark::report::PolicyRun;
 const LADDER: [(&str, &str, f64); 5] = [
     ("random_walk", "none", 2.9),
     ("coverage", "none", 4.7),
-    ("beam", "known_model", 38.7),
+    ("beam", "known", 38.7),
     ("oracle_beam", "truth", 45.7),
     (
         "a_very_long_name_that_no_label_has_room_for",
-        "known_model",
+        "known",
         39.5,
     ),
 ];
@@ -33,7 +33,7 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
         hit_rate: 0.25,
         mean_fire_cells: 100.0 * world_seed as f64,
         mean_plan_millis: 1.5,
-        brier: (estimator == "known_model").then_some(0.125),
+        brier: (estimator == "known").then_some(0.125),
         moves: 64,
         robots: 1,
         team: "alone".into(),
@@ -73,7 +73,7 @@ pub fn teams(n_worlds: u64) -> Vec<PolicyRun> {
                 team: team.into(),
                 mean_repeated: if is_joint { 0.125 } else { 0.25 },
                 rewards: vec![1.0; 4],
-                ..run("beam", "known_model", world, gain * (world + 1) as f64)
+                ..run("beam", "known", world, gain * (world + 1) as f64)
             }));
         }
     }

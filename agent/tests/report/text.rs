@@ -9,7 +9,7 @@ fn three_policies() -> Vec<PolicyRun> {
     let mut runs = Vec::new();
     for (policy, estimator, rewards) in [
         ("coverage", "none", [1.0, 3.0, 5.0]),
-        ("beam", "known_model", [2.0, 5.0, 8.0]),
+        ("beam", "known", [2.0, 5.0, 8.0]),
         ("oracle_beam", "truth", [4.0, 8.0, 8.0]),
     ] {
         for (world, reward) in (1..).zip(rewards) {
@@ -43,7 +43,7 @@ fn a_table_gives_errors_over_worlds_and_paired_differences() {
     for (policy, expected) in [
         (
             "beam",
-            "known_model 5.00 ± 1.73 +2.00 ± 0.58 60.0 0.250 60.0 0.1250 1.500",
+            "known 5.00 ± 1.73 +2.00 ± 0.58 60.0 0.250 60.0 0.1250 1.500",
         ),
         (
             "coverage",
@@ -62,7 +62,7 @@ fn a_table_gives_errors_over_worlds_and_paired_differences() {
         table.contains("less fire (1 world) | more fire (2 worlds)"),
         "{table}"
     );
-    let halves = ["beam", "known_model", "2.00 (n = 1)", "6.50 ± 1.50"];
+    let halves = ["beam", "known", "2.00 (n = 1)", "6.50 ± 1.50"];
     assert_eq!(row(&table, "beam", 1), halves);
 }
 
@@ -184,7 +184,7 @@ fn scores_of_tasks_lie_between_the_random_walk_and_the_oracle() {
     let task = |task: &str, rewards: &[(&str, [f64; 2])]| {
         let run = |policy: &str, seed, reward| PolicyRun {
             task: task.into(),
-            ..run(policy, "known_model", seed, reward)
+            ..run(policy, "known", seed, reward)
         };
         let of = |&(policy, [a, b]): &(&str, [f64; 2])| [run(policy, 0, a), run(policy, 1, b)];
         rewards.iter().flat_map(of).collect::<Vec<PolicyRun>>()

@@ -38,9 +38,9 @@ pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
 /// Returns the name and a description of each estimator on which options can be planned.
 #[pyfunction]
 pub fn estimator_names() -> Vec<(&'static str, &'static str)> {
-    let serves = |kind: &&BeliefKind| beliefs::of_options(kind.label).is_ok();
+    let serves = |kind: &&BeliefKind| beliefs::of_options(kind.name).is_ok();
     let kinds = beliefs::BELIEFS.iter().copied().filter(serves);
-    kinds.map(|kind| (kind.label, kind.about)).collect()
+    kinds.map(|kind| (kind.name, kind.about)).collect()
 }
 
 /// The attributes of Python's `WorldSpec` that beliefs and plans depend on.
@@ -119,7 +119,7 @@ impl Options {
             })
         });
         Ok(Self {
-            estimator: crew.estimator().label.into(),
+            estimator: crew.estimator().name.into(),
             first: (first, crew.model().clone()),
             prior: OnceLock::new(),
             worlds: Owned::new(
@@ -225,7 +225,7 @@ fn model(py: Python<'_>, spec: &Spec<'_>, estimator: &BeliefKind) -> PyResult<Mo
         };
         let expected = format!(
             "a model for the estimator '{}', or a checkpoint of a learned belief",
-            estimator.label
+            estimator.name
         );
         return Err(invalid(py, "model", expected, got));
     }

@@ -91,8 +91,7 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
     kinds.filter(|kind| kind.input == Input::Frames)
 }
 
-/// Finds a kind of belief by its name or label, either among the learned kinds or among the kinds that need only a
-/// model.
+/// Finds a kind of belief by its name, either among the learned kinds or among the kinds that need only a model.
 pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static BeliefKind> {
     let serves =
         |kind: &&BeliefKind| kind.input == Input::Frames && kind.learned_by.is_some() == is_learned;

@@ -25,14 +25,14 @@ WORLD: dict[str, Any] = {
 
 #: The estimator of each belief, and its prior.
 BELIEFS: dict[str, dict[str, Any]] = {
-    "known_model": {"estimator": "known_model"},
-    "known_model, initial": {"estimator": "known_model", "prior": "initial"},
-    "spatial_filter": {"estimator": "spatial_filter"},
-    "spatial_filter, initial": {"estimator": "spatial_filter", "prior": "initial"},
+    "known_model": {"estimator": "known"},
+    "known_model, initial": {"estimator": "known", "prior": "initial"},
+    "spatial_filter": {"estimator": "known+spatial"},
+    "spatial_filter, initial": {"estimator": "known+spatial", "prior": "initial"},
     "learned_filter": {"checkpoint": "learned_filter"},
     "learned_spatial_filter": {
         "checkpoint": "learned_filter",
-        "estimator": "learned_spatial_filter",
+        "estimator": "learned+spatial",
     },
     "learned_filter, own kernels": {"checkpoint": "own_kernels"},
     "neural_belief": {"checkpoint": "neural_belief"},

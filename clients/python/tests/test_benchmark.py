@@ -108,7 +108,7 @@ def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
 
 
 def test_a_row_names_the_estimator_of_the_belief() -> None:
-    for changes, expected in (({}, "known_model"), ({"estimator": "mine"}, "mine")):
+    for changes, expected in (({}, "known"), ({"estimator": "mine"}, "mine")):
         assert {row.estimator for row in score(observation="local", **changes)} == {expected}
     assert {row.estimator for row in score()} == {"none"}
 

@@ -51,7 +51,7 @@ def decide(env: Any) -> Any:
     return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
 
 
-@pytest.mark.parametrize("keywords", [{}, {"truth": True, "estimator": "spatial_filter"}])
+@pytest.mark.parametrize("keywords", [{}, {"truth": True, "estimator": "known+spatial"}])
 def test_the_environment_checker_passes(keywords: dict[str, Any]) -> None:
     env = make(render_mode="rgb_array", **keywords)
     with environments.no_warnings():
@@ -173,7 +173,7 @@ def test_beliefs_are_published_to_readers() -> None:
             envs.step(np.array([0, 3]))
             outlook = reader.receive(0.0)
             if outlook is not None:
-                assert (outlook.policy, outlook.belief_from) == ("options", "known_model")
+                assert (outlook.policy, outlook.belief_from) == ("options", "known")
                 assert outlook.robots == range(outlook.world, outlook.world + 1)
                 expected.discard((outlook.world, outlook.objective))
             return not expected
@@ -189,7 +189,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(checkpoints: Path, tmp_path: 
             with refuses("checkpoint: expected the world's 4 observations, got 3"):
                 maker(checkpoint=checkpoints / name, model=model)
     # An estimator that knows the model ignores learned filters.
-    known = make(checkpoint=checkpoints / "learned_filter", estimator="known_model")
+    known = make(checkpoint=checkpoints / "learned_filter", estimator="known")
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
 
 
@@ -202,7 +202,7 @@ def test_recorded_worlds_need_a_learned_belief(tmp_path: Path) -> None:
     env: Any = closed_later(gymnasium.make(OBJECTIVE, checkpoint=checkpoint, **world))
     env.reset(seed=1000)
     assert env.step(0)[4]["step"] == 1
-    with refuses("model: expected a model for the estimator 'known_model'.*got recorded worlds"):
+    with refuses("model: expected a model for the estimator 'known'.*got recorded worlds"):
         gymnasium.make(OBJECTIVE, **world)
 
 
@@ -284,7 +284,7 @@ def test_waiting_for_truth_ends_at_the_timeout() -> None:
 
 def test_a_hidden_model_must_be_passed() -> None:
     instance = server(reveal_model=False).instance
-    with refuses("model: expected a model for the estimator 'known_model', or a checkpoint"):
+    with refuses("model: expected a model for the estimator 'known', or a checkpoint"):
         make(instance=instance)
     env = make(instance=instance, model="wildfire")
     env.reset(seed=1000)
@@ -304,13 +304,13 @@ def test_a_learned_belief_needs_no_revealed_model(checkpoints: Path) -> None:
 
 def test_wrong_keyword_values_are_refused() -> None:
     for keywords, words in (
-        ({"estimator": "truth"}, 'estimator: expected one of known_model, .*, got "truth"'),
+        ({"estimator": "truth"}, 'estimator: expected one of known, .*, got "truth"'),
         ({"prior": "none"}, "prior: expected 'simulated', 'initial' or 'uniform', got 'none'"),
         ({"estimator": 3}, "estimator: expected a name, got 3"),
         ({"prior": None}, "prior: expected a name, got None"),
         ({"checkpoint": 3}, "checkpoint: expected a path, got 3"),
         ({"checkpoint": "no file"}, "checkpoint no file: No such file"),
-        ({"estimator": "neural_belief"}, "checkpoint.*of `train --learner neural`"),
+        ({"estimator": "neural"}, "checkpoint.*of `train --learner neural`"),
     ):
         for maker in (make, make_vec):
             with refuses(words):

@@ -80,7 +80,7 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
     [
         (WILDFIRE, {"observation": "robot"}),
         (MOVES, {"observation": "move", "reward": "move"}),
-        (OBJECTIVE, {"prior": "uniform", "estimator": "spatial_filter"}),
+        (OBJECTIVE, {"prior": "uniform", "estimator": "known+spatial"}),
         *ALL.items(),
     ],
     ids=str,

@@ -17,7 +17,6 @@ use std::borrow::Cow;
 
 pub const AUTOENCODER: BeliefKind = BeliefKind {
     name: "autoencoder",
-    label: "autoencoder",
     about: "the paper's dynamic autoencoder",
     input: Input::Frames,
     knows_model: false,

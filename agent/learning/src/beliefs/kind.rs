@@ -10,10 +10,8 @@ use std::fmt;
 
 /// A kind of belief: its constructor, names and properties.
 pub struct BeliefKind {
-    /// Name in policies, such as `known+spatial`.
+    /// Name in policies, files, settings and views, such as `known+spatial`.
     pub name: &'static str,
-    /// Name in files, settings and views, such as `spatial_filter`.
-    pub label: &'static str,
     /// Short description.
     pub about: &'static str,
     pub input: Input,

@@ -11,7 +11,6 @@ use emberwatch_model::Model;
 
 pub const KNOWN: BeliefKind = BeliefKind {
     name: "known",
-    label: "known_model",
     about: "the Bayes filter with the true model",
     input: Input::Frames,
     knows_model: true,
@@ -23,7 +22,6 @@ pub const KNOWN: BeliefKind = BeliefKind {
 
 pub const KNOWN_SECOND_ORDER: BeliefKind = BeliefKind {
     name: "known+second-order",
-    label: "second_order_filter",
     about: "known, with a second-order mean of the ratio in eq. 3",
     handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::SecondOrder)),
     build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::SecondOrder)?)),
@@ -32,7 +30,6 @@ pub const KNOWN_SECOND_ORDER: BeliefKind = BeliefKind {
 
 pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
     name: "known+cavities",
-    label: "cavity_filter",
     about: "known, predicting a cell without its own influence on its neighbours",
     handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::Cavities)),
     build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::Cavities)?)),
@@ -41,7 +38,6 @@ pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
 
 pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
     name: "known+spatial",
-    label: "spatial_filter",
     about: "known, where observations also correct neighbouring cells",
     handover: Some(|model| spatial_handover(model, PredictionKind::MeanField)),
     build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::MeanField)?)),
@@ -50,7 +46,6 @@ pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
 
 pub const KNOWN_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "known+spatial+cavities",
-    label: "spatial_cavity_filter",
     about: "known+spatial, predicting like known+cavities",
     handover: Some(|model| spatial_handover(model, PredictionKind::Cavities)),
     build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::Cavities)?)),

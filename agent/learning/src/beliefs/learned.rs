@@ -16,7 +16,6 @@ use serde::{Deserialize, Serialize};
 
 pub const LEARNED: BeliefKind = BeliefKind {
     name: "learned",
-    label: "learned_filter",
     about: "a Bayes filter with learned parameters",
     input: Input::Frames,
     knows_model: false,
@@ -34,7 +33,6 @@ pub const LEARNED: BeliefKind = BeliefKind {
 
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
-    label: "learned_spatial_filter",
     about: "learned, where observations also correct neighbouring cells",
     build: |conditions| {
         Ok(model(conditions)?.estimator(true, PredictionKind::MeanField, conditions.shape))
@@ -44,7 +42,6 @@ pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
 
 pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
     name: "learned+cavities",
-    label: "learned_cavity_filter",
     about: "learned, predicting like known+cavities",
     build: |conditions| {
         Ok(model(conditions)?.estimator(false, PredictionKind::Cavities, conditions.shape))
@@ -54,7 +51,6 @@ pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
 
 pub const LEARNED_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "learned+spatial+cavities",
-    label: "learned_spatial_cavity_filter",
     about: "learned+spatial, predicting like known+cavities",
     build: |conditions| {
         Ok(model(conditions)?.estimator(true, PredictionKind::Cavities, conditions.shape))

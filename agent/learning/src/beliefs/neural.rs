@@ -32,7 +32,6 @@ const FILTER: &str = "filter.";
 
 pub const NEURAL: BeliefKind = BeliefKind {
     name: "neural",
-    label: "neural_belief",
     about: "a learned network that predicts observations from the last ones",
     input: Input::Frames,
     knows_model: false,
@@ -53,7 +52,6 @@ pub const NEURAL: BeliefKind = BeliefKind {
 
 pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
     name: "neural+sensor",
-    label: "neural_sensor_belief",
     about: "neural, converted to states by the true model's observation matrix",
     knows_model: true,
     build: |conditions| {

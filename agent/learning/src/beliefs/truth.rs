@@ -5,7 +5,6 @@ use emberwatch_belief::estimation::truth::{Oracle, Unchanging};
 
 pub const NONE: BeliefKind = BeliefKind {
     name: "none",
-    label: "none",
     about: "the first belief, never updated",
     input: Input::Nothing,
     knows_model: false,
@@ -17,7 +16,6 @@ pub const NONE: BeliefKind = BeliefKind {
 
 pub const TRUTH: BeliefKind = BeliefKind {
     name: "truth",
-    label: "truth",
     about: "the hidden states, predicted one step ahead; needs a server with --publish-truth",
     input: Input::States,
     chart: ("fed with the truth", [0xe6, 0x9f, 0x00]),

@@ -119,7 +119,7 @@ pub struct NetworkDqnConfig {
 /// Settings of `train --learner decisions`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DecisionsConfig {
-    /// The name or the label of the belief that decisions are based on.
+    /// The name of the belief that decisions are based on.
     pub estimator: String,
     pub filter_steps: u64,
     pub beam_width: usize,

@@ -171,7 +171,7 @@ impl DecisionsLearner {
             belief.map_or((None, Vec::new()), |(it, tensors)| (Some(it), tensors));
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: self.base.kind.label.into(),
+            estimator: self.base.kind.name.into(),
             belief,
             world_steps: self.world_steps,
             earned: self.earned,

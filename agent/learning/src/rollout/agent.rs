@@ -342,7 +342,7 @@ impl Agent {
     pub fn intent(&self, planning: Duration) -> Intent {
         Intent {
             policy: self.policy.name.clone(),
-            belief_from: self.policy.belief.label.into(),
+            belief_from: self.policy.belief.name.into(),
             objective: self.aim.clone(),
             states: self.state_names.clone(),
             plan_millis: planning.as_secs_f64() * 1e3,

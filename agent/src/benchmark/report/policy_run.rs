@@ -11,7 +11,7 @@ pub const ALONE: &str = "alone";
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
     pub policy: String,
-    /// Label of the estimator: `none`, `known_model`, `truth` or a learned estimator.
+    /// Name of the belief: `none`, `known`, `truth` or another.
     pub estimator: String,
     pub world_seed: u64,
     pub steps: u64,

@@ -39,7 +39,7 @@ pub(super) struct Held {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedDecisions {
     pub options: Vec<String>,
-    /// The label of the belief that the decisions are based on.
+    /// The name of the belief that the decisions are based on.
     pub estimator: String,
     pub(super) belief: Option<SavedBelief>,
     pub world_steps: u64,
@@ -141,7 +141,7 @@ impl SavedDecisions {
         check(
             is_neural == (*kind == NEURAL),
             "belief",
-            kind.label,
+            kind.name,
             "another",
         )?;
         Ok(match &self.belief {
@@ -210,7 +210,7 @@ mod tests {
         let dqn = Dqn::new(config.decisions.settings(), SHAPE, 3);
         let state = SavedDecisions {
             options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: KNOWN.label.into(),
+            estimator: KNOWN.name.into(),
             belief: None,
             world_steps: 7,
             earned: 0.5,

@@ -68,7 +68,7 @@ def evaluate(
         burn_in: Number of steps before the first scored one; None: the value of the task or the
             running server, or 25,000. Recorded worlds have no burn-in.
         env: The environment: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
-        estimator: The name of the policy's belief in the table; None: `known_model` if
+        estimator: The name of the policy's belief in the table; None: `known` if
             `observation` has a belief, otherwise `none`.
         deterministic: Argument of `predict`.
         batch: Number of worlds to simulate at the same time, in the order of the seeds.
@@ -120,7 +120,7 @@ def evaluate(
     parts = set(names_of(keywords.get("observation")))
     columns = {
         "policy": name,
-        "estimator": estimator or ("known_model" if OF_BELIEF & parts else "none"),
+        "estimator": estimator or ("known" if OF_BELIEF & parts else "none"),
         "robots": n_robots,
         "team": "shared" if n_robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,

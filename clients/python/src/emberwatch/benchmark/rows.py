@@ -26,7 +26,7 @@ class Row:
     """
 
     policy: str
-    #: The policy's belief: `none`, `known_model`, or a name of your choice.
+    #: The policy's belief: `none`, `known`, or a name of your choice.
     estimator: str
     world_seed: int
     #: Number of scored steps.

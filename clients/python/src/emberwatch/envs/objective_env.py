@@ -55,18 +55,18 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     As in `WildfireEnv` without `observation`, `reward` and `robot`, for worlds of one robot. Also:
 
     * `estimator`: the kind of belief. The default is the kind that `checkpoint` contains, or
-      `"known_model"` without a checkpoint. If fires are rare, learned estimators find several times
+      `"known"` without a checkpoint. If fires are rare, learned estimators find several times
       as many burning cells as estimators with a known model.
-        * `"known_model"`: the Bayes filter with the true model
-        * `"spatial_filter"`: known, where observations also correct neighbouring cells
-        * `"second_order_filter"`: known, with a second-order mean of the ratio in eq. 3
-        * `"cavity_filter"`: known, predicting a cell without its own influence on its neighbours
-        * `"spatial_cavity_filter"`: known+spatial, predicting like known+cavities
-        * `"learned_filter"`: a Bayes filter with learned parameters
-        * `"learned_spatial_filter"`: learned, where observations also correct neighbouring cells
-        * `"learned_cavity_filter"`: learned, predicting like known+cavities
-        * `"learned_spatial_cavity_filter"`: learned+spatial, predicting like known+cavities
-        * `"neural_belief"`: a learned network that predicts observations from the last ones
+        * `"known"`: the Bayes filter with the true model
+        * `"known+spatial"`: known, where observations also correct neighbouring cells
+        * `"known+second-order"`: known, with a second-order mean of the ratio in eq. 3
+        * `"known+cavities"`: known, predicting a cell without its own influence on its neighbours
+        * `"known+spatial+cavities"`: known+spatial, predicting like known+cavities
+        * `"learned"`: a Bayes filter with learned parameters
+        * `"learned+spatial"`: learned, where observations also correct neighbouring cells
+        * `"learned+cavities"`: learned, predicting like known+cavities
+        * `"learned+spatial+cavities"`: learned+spatial, predicting like known+cavities
+        * `"neural"`: a learned network that predicts observations from the last ones
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; its
       first computation takes about a second), `"initial"` or `"uniform"`.

@@ -15,16 +15,16 @@ from emberwatch.envs.session import Session
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 
 Estimator: TypeAlias = Literal[
-    "known_model",
-    "spatial_filter",
-    "second_order_filter",
-    "cavity_filter",
-    "spatial_cavity_filter",
-    "learned_filter",
-    "learned_spatial_filter",
-    "learned_cavity_filter",
-    "learned_spatial_cavity_filter",
-    "neural_belief",
+    "known",
+    "known+spatial",
+    "known+second-order",
+    "known+cavities",
+    "known+spatial+cavities",
+    "learned",
+    "learned+spatial",
+    "learned+cavities",
+    "learned+spatial+cavities",
+    "neural",
 ]
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
