@@ -64,11 +64,7 @@ fn a_neural_belief_corrects_a_filter_and_decisions_learn_on_it() {
     let policies = "--policies neural_beam --baseline neural_beam";
     place.compare("out", policies).check_prints("neural_beam");
     let wrong = format!("{WORLDS} {}", place.flag("out"));
-    place.refuse(
-        "other",
-        &wrong,
-        "--checkpoint | for the estimator learned",
-    );
+    place.refuse("other", &wrong, "--checkpoint | for the estimator learned");
 
     let flags = format!("{WORLDS} --learner decisions --estimator neural");
     place.train("decisions", &format!("{flags} --steps 10"));

@@ -72,7 +72,9 @@ mod tests {
     fn each_name_and_text_identifies_one_kind() {
         for &kind in BELIEFS {
             assert_eq!(named(kind.name), Some(kind));
-            let same = BELIEFS.iter().filter(|it| it.name == kind.name || it.about == kind.about);
+            let same = BELIEFS
+                .iter()
+                .filter(|it| it.name == kind.name || it.about == kind.about);
             assert_eq!(same.count(), 1, "{kind:?}");
         }
     }

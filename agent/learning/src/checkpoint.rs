@@ -197,6 +197,12 @@ pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
 
 /// Reads a checkpoint. Returns its kind and its contents.
 pub fn read(path: &Path) -> Result<(String, Contents)> {
+    let contents = decode(&read_bytes(path)?);
+    contents.with_context(|| format!("checkpoint {}", path.display()))
+}
+
+/// Reads the bytes of a checkpoint, for [`decode`].
+pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
     let bytes = || {
         let found = std::fs::metadata(path)?;
         ensure!(
@@ -208,8 +214,7 @@ pub fn read(path: &Path) -> Result<(String, Contents)> {
         File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
         Ok(bytes)
     };
-    let contents = bytes().and_then(|bytes| decode(&bytes));
-    contents.with_context(|| format!("checkpoint {}", path.display()))
+    bytes().with_context(|| format!("checkpoint {}", path.display()))
 }
 
 /// Encodes a checkpoint for a kind of learner.

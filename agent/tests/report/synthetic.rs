@@ -8,11 +8,7 @@ const LADDER: [(&str, &str, f64); 5] = [
     ("coverage", "none", 4.7),
     ("beam", "known", 38.7),
     ("oracle_beam", "truth", 45.7),
-    (
-        "a_very_long_name_that_no_label_has_room_for",
-        "known",
-        39.5,
-    ),
+    ("a_very_long_name_that_no_label_has_room_for", "known", 39.5),
 ];
 
 /// Returns a number in `-1..1` that depends only on the arguments.

@@ -1,15 +1,21 @@
 //! The worlds behind a connection: either a server's worlds, or worlds in this process.
 
 use crate::errors::{no_memory, no_threads, raise, warn};
-use crate::refusal::failed;
+use crate::model::shape_of;
+use crate::refusal::{failed, refused};
 use crate::wire::Connection;
 use emberwatch_messages::backend::Backend;
 use emberwatch_messages::limits::threads::spawn;
-use emberwatch_sim::config::{Checked, ServerConfig};
+use emberwatch_model::Model;
+use emberwatch_model::built_in::state_names;
+use emberwatch_model::task::Task;
+use emberwatch_sim::config::{Checked, ServerConfig, model_named};
 use emberwatch_sim::embedded::{Embedded, wait_for};
 use emberwatch_sim::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
+use std::ops::Range;
+use std::path::Path;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
@@ -30,74 +36,203 @@ impl Worlds {
     }
 }
 
-/// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. If `warns` is set, warns
-/// about robots whose start cells are enclosed by no-fly cells.
-pub fn embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Embedded> {
-    let checked = checked(py, settings)?;
-    if warns {
-        warn_of_starts(py, &checked)?;
+/// Milliseconds without use after which a lease on worlds in this process expires, unless a setting decides it: a day,
+/// because no other client waits for their robots.
+const LEASE_MILLIS: u64 = 86_400_000;
+
+/// Settings of worlds in this process, with the files that they name, which are read only here.
+#[pyclass(frozen, module = "emberwatch._native")]
+pub struct CheckedSettings {
+    /// The given settings as JSON, with absolute paths.
+    given: String,
+    checked: Checked,
+}
+
+#[pymethods]
+impl CheckedSettings {
+    /// Reads and checks settings, given as JSON with the keys of `config/server.toml`. Warns about robots whose start
+    /// cells are enclosed by no-fly cells.
+    #[new]
+    fn new(py: Python<'_>, settings: &str) -> PyResult<Self> {
+        let it = Self::read(py, settings)?;
+        let mut starts = it.checked.reach.closed_in.iter();
+        starts.try_for_each(|closed_in| warn(py, closed_in))?;
+        Ok(it)
     }
-    check_embeddable(py, &checked.config)?;
-    let worlds = py.detach(|| Embedded::new(checked));
-    worlds.map_err(|error| match error.downcast_ref() {
-        Some(short) => no_memory(py, short),
-        None => match error.downcast_ref() {
-            Some(short) => no_threads(py, short),
-            None => failed(py, &format!("{error:#}"), "embedded"),
-        },
-    })
+
+    /// Returns the same settings with another number of worlds.
+    fn with_worlds(&self, py: Python<'_>, worlds: u32) -> PyResult<Self> {
+        let checked = self.checked.clone().with_worlds(worlds);
+        Ok(Self {
+            given: self.given.clone(),
+            checked: checked.map_err(|problem| refused(py, problem))?,
+        })
+    }
+
+    /// All settings as JSON, with every default filled in.
+    #[getter]
+    fn settings(&self) -> String {
+        serde_json::to_string(&self.checked.config).expect("invariant: settings serialise")
+    }
+
+    /// The text of the model file, with the maps from other files included; for recorded states, of their description.
+    #[getter]
+    fn description(&self) -> String {
+        match &self.checked.recorded {
+            Some(states) => states.description.clone(),
+            None => text_of(&self.checked.model),
+        }
+    }
+
+    /// The task's name, moves, robots, steps and test seeds.
+    #[getter]
+    fn task(&self) -> Option<(&str, usize, u32, u64, u64, u64, &str)> {
+        let task = self.checked.task.as_ref()?;
+        let ids = task.listing.as_ref().map_or("", |listing| &listing.ids);
+        let Range { start, end } = task.test_seeds;
+        let (moves, robots, steps) = (task.moves, task.robots, task.max_steps);
+        Some((&task.name, moves, robots, steps, start, end, ids))
+    }
+
+    #[getter]
+    fn worlds_fingerprint(&self) -> String {
+        Settings::of(&self.checked).worlds_fingerprint()
+    }
+
+    fn __deepcopy__<'py>(slf: Bound<'py, Self>, _memo: &Bound<'py, PyAny>) -> Bound<'py, Self> {
+        slf
+    }
+
+    fn __reduce__<'py>(
+        &self,
+        py: Python<'py>,
+    ) -> PyResult<(Bound<'py, PyAny>, (&str, u32, String))> {
+        let again = py.import("emberwatch._native")?.getattr("read_again")?;
+        let worlds = self.checked.config.worlds;
+        Ok((again, (&self.given, worlds, self.worlds_fingerprint())))
+    }
 }
 
-/// Checks settings, given as JSON. Returns them as JSON with every default filled in.
+impl CheckedSettings {
+    /// Starts the worlds in this process. `seed` is the first world's; `None`: the seed in the settings.
+    ///
+    /// # Errors
+    /// If a setting applies only to a server, or there is too little memory.
+    pub fn embed(&self, py: Python<'_>, seed: Option<u64>) -> PyResult<Embedded> {
+        let mut checked = self.checked.clone();
+        checked.config.seed = seed.unwrap_or(checked.config.seed);
+        check_embeddable(py, &checked.config)?;
+        let worlds = py.detach(|| Embedded::new(checked));
+        worlds.map_err(|error| match error.downcast_ref() {
+            Some(short) => no_memory(py, short),
+            None => match error.downcast_ref() {
+                Some(short) => no_threads(py, short),
+                None => failed(py, &format!("{error:#}"), "embedded"),
+            },
+        })
+    }
+
+    fn read(py: Python<'_>, settings: &str) -> PyResult<Self> {
+        let mut given: Map<String, Value> =
+            serde_json::from_str(settings).map_err(|error| refused(py, error))?;
+        let paths: Vec<String> = given
+            .values()
+            .filter_map(Value::as_str)
+            .map(Into::into)
+            .collect();
+        let asked = given.clone();
+        let read = move || {
+            let settings = ServerConfig {
+                lease_millis: LEASE_MILLIS,
+                ..ServerConfig::default()
+            };
+            settings.with(&asked).and_then(ServerConfig::check)
+        };
+        let checked = in_time(py, &paths, read)?.map_err(|problem| refused(py, problem))?;
+        for name in ["task", "model", "states"] {
+            if let Some(Value::String(path)) = given.get_mut(name) {
+                make_absolute(path);
+            }
+        }
+        let given = Value::Object(given).to_string();
+        Ok(Self { given, checked })
+    }
+}
+
+/// Reads settings again for a copy in another process. Refuses files that have changed since `fingerprint` was made.
 #[pyfunction]
-pub fn check_settings(py: Python<'_>, settings: &str) -> PyResult<String> {
-    let checked = checked(py, settings)?;
-    warn_of_starts(py, &checked)?;
-    let settings = checked.config;
-    Ok(serde_json::to_string(&settings).expect("invariant: settings serialise"))
+pub fn read_again(
+    py: Python<'_>,
+    settings: &str,
+    worlds: u32,
+    fingerprint: &str,
+) -> PyResult<CheckedSettings> {
+    let read = CheckedSettings::read(py, settings)?.with_worlds(py, worlds)?;
+    if read.worlds_fingerprint() == fingerprint {
+        return Ok(read);
+    }
+    let problem = "worlds: the file of their task, model or states has changed since they were made: make them again";
+    Err(refused(py, problem))
 }
 
-/// Returns the fingerprint of the worlds with these settings, without simulating them.
+/// Returns the text of a model: of the built-in one with this name, of the file at this path with the maps from other
+/// files included, or of `name` itself if it is the text of a file.
 #[pyfunction]
-pub fn worlds_fingerprint(py: Python<'_>, settings: &str) -> PyResult<String> {
-    Ok(Settings::of(&checked(py, settings)?).worlds_fingerprint())
+pub fn model_text(py: Python<'_>, name: String) -> PyResult<String> {
+    if let Some((_, text)) = Model::built_in_files().find(|(known, _)| *known == name) {
+        return Ok(text.into());
+    }
+    let paths = [name.clone()];
+    let model = in_time(py, &paths, move || model_named(&name))?;
+    let model = model.map_err(|problem| refused(py, problem))?;
+    let file = model.file();
+    let map = file.zone_map.as_ref().or(file.no_fly.as_ref());
+    let (height, width) = map
+        .and_then(|map| map.grid().ok())
+        .map_or((64, 64), |map| map.dim());
+    let shape = shape_of(py, height, width)?;
+    model
+        .check_on(shape)
+        .map_err(|problem| refused(py, problem))?;
+    Ok(text_of(&model))
 }
 
-/// Reads settings and the files that they name. A separate thread reads pipes, devices and other special files, so that
-/// waiting for them can time out or be interrupted.
-fn checked(py: Python<'_>, settings: &str) -> PyResult<Checked> {
-    let given: Map<String, Value> =
-        serde_json::from_str(settings).map_err(|error| refused(py, &error.to_string()))?;
-    let may_block = may_block(&given);
-    let read = move || {
-        let settings = ServerConfig::default().with(&given);
-        settings.and_then(ServerConfig::check)
-    };
-    let checked = if may_block {
-        let (sender, receiver) = channel();
-        let reader = spawn("settings", move || drop(sender.send(read())));
-        reader.map_err(|short| no_threads(py, &short))?;
-        let wait = move || wait_for(&receiver, Instant::now(), LONGEST_READ);
-        let checked = py.detach(wait);
-        checked.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))?
-    } else {
-        py.detach(read)
-    };
-    checked.map_err(|problem| refused(py, &problem.to_string()))
+fn text_of(model: &Model) -> String {
+    toml::to_string(model.file()).expect("invariant: a model was read from TOML")
 }
 
-/// Returns whether a setting names a pipe, device or other special file, which can keep its reader waiting.
-fn may_block(given: &Map<String, Value>) -> bool {
-    let paths = given.values().filter_map(Value::as_str);
-    let kinds = paths.filter_map(|path| std::fs::metadata(path).ok());
-    let mut others = kinds.filter(|kind| !kind.is_file() && !kind.is_dir());
-    others.next().is_some()
+/// Makes the path of a file absolute. Names of built-in files stay.
+fn make_absolute(path: &mut String) {
+    let mut built_in = Task::built_in_names()
+        .chain(Model::built_in_names())
+        .chain(state_names());
+    let is_file = Path::new(path).exists() && !built_in.any(|name| name == path);
+    if let (true, Ok(absolute)) = (is_file, std::path::absolute(&*path)) {
+        *path = absolute.display().to_string();
+    }
 }
 
-/// Warns about robots whose start cells are enclosed by no-fly cells.
-fn warn_of_starts(py: Python<'_>, checked: &Checked) -> PyResult<()> {
-    let mut starts = checked.reach.closed_in.iter();
-    starts.try_for_each(|closed_in| warn(py, closed_in))
+/// Runs `read`. If one of the paths is a pipe, device or other special file, a separate thread runs it, so that the wait
+/// can time out or be interrupted.
+fn in_time<T: Send + 'static>(
+    py: Python<'_>,
+    paths: &[String],
+    read: impl FnOnce() -> T + Send + 'static,
+) -> PyResult<T> {
+    if !paths.iter().any(may_block) {
+        return Ok(py.detach(read));
+    }
+    let (sender, receiver) = channel();
+    let reader = spawn("settings", move || drop(sender.send(read())));
+    reader.map_err(|short| no_threads(py, &short))?;
+    let read = py.detach(move || wait_for(&receiver, Instant::now(), LONGEST_READ));
+    read.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))
+}
+
+/// Returns whether a path is that of a pipe, device or other special file, which can keep its reader waiting.
+fn may_block(path: &String) -> bool {
+    let found = std::fs::metadata(path);
+    found.is_ok_and(|kind| !kind.is_file() && !kind.is_dir())
 }
 
 /// Refuses settings that apply only to a server.
@@ -119,10 +254,6 @@ fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
         .find(|(one, other)| one != other);
     wrong.map_or(Ok(()), |((setting, got), _)| {
         let expected = "expected to be left out, as worlds in this process have no server";
-        Err(refused(py, &format!("{setting}: {expected}, got {got}")))
+        Err(refused(py, format!("{setting}: {expected}, got {got}")))
     })
-}
-
-fn refused(py: Python<'_>, problem: &str) -> PyErr {
-    crate::errors::error(py, "InvalidArgumentError", (problem.trim(),))
 }

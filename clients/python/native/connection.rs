@@ -1,7 +1,7 @@
 //! Connections to a server or to embedded worlds.
 
 use crate::answer::Answer;
-use crate::backend::{Worlds, embedded};
+use crate::backend::{CheckedSettings, Worlds};
 use crate::errors::{raise, raise_of_channel};
 use crate::model::shape_of;
 use crate::owned::Owned;
@@ -48,12 +48,15 @@ impl Server {
         Self::of(py, instance, Worlds::Served(Box::new(wire)))
     }
 
-    /// Starts worlds in this process. `settings` is JSON with the keys of `config/server.toml`. If `warns` is set,
-    /// warns about robots whose start cells are enclosed by no-fly cells.
+    /// Starts worlds in this process. `seed` is the first world's; `None`: the seed in the settings.
     #[staticmethod]
-    #[pyo3(name = "embedded")]
-    fn new_embedded(py: Python<'_>, settings: &str, warns: bool) -> PyResult<Self> {
-        let worlds = Worlds::Embedded(Box::new(embedded(py, settings, warns)?));
+    #[pyo3(name = "embedded", signature = (settings, seed=None))]
+    fn new_embedded(
+        py: Python<'_>,
+        settings: &CheckedSettings,
+        seed: Option<u64>,
+    ) -> PyResult<Self> {
+        let worlds = Worlds::Embedded(Box::new(settings.embed(py, seed)?));
         Self::of(py, INSTANCE, worlds)
     }
 

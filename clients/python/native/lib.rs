@@ -56,11 +56,13 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<estimators::Estimators>()?;
     module.add_class::<merit::MeritTally>()?;
     module.add_class::<options::Options>()?;
+    module.add_function(wrap_pyfunction!(options::checkpoint_bytes, module)?)?;
     module.add_function(wrap_pyfunction!(options::estimator_names, module)?)?;
     module.add_function(wrap_pyfunction!(options::option_names, module)?)?;
     module.add_function(wrap_pyfunction!(origin::belief_kinds, module)?)?;
-    module.add_function(wrap_pyfunction!(backend::check_settings, module)?)?;
-    module.add_function(wrap_pyfunction!(backend::worlds_fingerprint, module)?)?;
+    module.add_class::<backend::CheckedSettings>()?;
+    module.add_function(wrap_pyfunction!(backend::model_text, module)?)?;
+    module.add_function(wrap_pyfunction!(backend::read_again, module)?)?;
     module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
     module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;
@@ -71,8 +73,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("MAX_VALUES", MAX_VALUES)?;
     module.add_function(wrap_pyfunction!(model::built_in, module)?)?;
     module.add_function(wrap_pyfunction!(model::description_with_radius, module)?)?;
-    module.add_function(wrap_pyfunction!(model::grid_of_maps, module)?)?;
-    module.add_function(wrap_pyfunction!(model::model_text, module)?)?;
     module.add_function(wrap_pyfunction!(model::model_with_radius, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_description, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_model, module)?)?;

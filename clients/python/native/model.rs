@@ -3,7 +3,7 @@
 use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
 use emberwatch_model::task::Task;
-use emberwatch_model::{CellMap, Description, Model, ModelFile, parse_color};
+use emberwatch_model::{CellMap, Description, Model, parse_color};
 use emberwatch_sim::states_file::StatesFile;
 use numpy::ToPyArray;
 use numpy::ndarray::{Axis, stack};
@@ -11,7 +11,6 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 /// Returns the text of each built-in file of a kind, by name. Kinds: `"models"`, `"tasks"`, and `"states"`, which are
 /// descriptions of recorded states.
@@ -42,22 +41,6 @@ pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDic
     let zone_map = model.zone_map().map(|map| map.to_pyarray(py));
     fields.set_item("zone_map", zone_map)?;
     Ok(fields)
-}
-
-/// Returns the height and width of a model file's maps; `None` if the file has no maps, or is invalid.
-#[pyfunction]
-pub fn grid_of_maps(path: PathBuf) -> Option<(usize, usize)> {
-    let model = Model::read(&path).ok()?;
-    let file = model.file();
-    let map = file.zone_map.as_ref().or(file.no_fly.as_ref())?;
-    map.grid().ok().map(|map| map.dim())
-}
-
-/// Returns the text of a model file, with the maps from separate files included.
-#[pyfunction]
-pub fn model_text(path: PathBuf) -> PyResult<String> {
-    let file = ModelFile::read(&path).map_err(refused)?;
-    toml::to_string(&file).map_err(refused)
 }
 
 /// Returns the text of a model file with its sensor radius replaced. The radius is in rows and columns beyond the path.

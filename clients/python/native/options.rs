@@ -13,13 +13,15 @@ use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::feature_names;
 use emberwatch_learning::beliefs::{self, BeliefKind};
+use emberwatch_learning::checkpoint::read_bytes;
 use emberwatch_learning::config::{AgentConfig, PriorKind};
+use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners;
 use emberwatch_learning::options::{Crew, usual};
 use emberwatch_model::{Description, Model};
-use emberwatch_network::Device;
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
+use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
@@ -41,6 +43,14 @@ pub fn estimator_names() -> Vec<(&'static str, &'static str)> {
     let serves = |kind: &&BeliefKind| beliefs::of_options(kind.name).is_ok();
     let kinds = beliefs::BELIEFS.iter().copied().filter(serves);
     kinds.map(|kind| (kind.name, kind.about)).collect()
+}
+
+/// Returns the bytes of a checkpoint, to be read only once.
+#[pyfunction]
+pub fn checkpoint_bytes(py: Python<'_>, path: PathBuf) -> PyResult<Cow<'static, [u8]>> {
+    let bytes = py.detach(|| read_bytes(&path));
+    let bytes = bytes.map_err(|error| refused(py, format!("{error:#}")))?;
+    Ok(bytes.into())
 }
 
 /// The attributes of Python's `WorldSpec` that beliefs and plans depend on.
@@ -76,7 +86,8 @@ pub struct Options {
 
 #[pymethods]
 impl Options {
-    /// Checks all arguments. Beliefs exist only after [`Self::begin`]. `watched` is the instance in which beliefs are
+    /// Checks all arguments. Beliefs exist only after [`Self::begin`]. `checkpoint` is a path, for errors, and the bytes
+    /// of its file. `watched` is the instance in which beliefs are
     /// published, and the number that the first of these worlds has in that instance.
     #[new]
     fn new(
@@ -84,7 +95,7 @@ impl Options {
         spec: Spec<'_>,
         n_worlds: usize,
         estimator: Option<&str>,
-        checkpoint: Option<PathBuf>,
+        checkpoint: Option<(String, Vec<u8>)>,
         prior: &str,
         watched: Option<(String, u32)>,
     ) -> PyResult<Self> {
@@ -95,8 +106,10 @@ impl Options {
             let got = format!("'{prior}'");
             invalid(py, "prior", "'simulated', 'initial' or 'uniform'", got)
         })?;
-        let learned = py.detach(|| learners::read(checkpoint.as_deref(), &Device::Cpu));
-        let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
+        let learned = checkpoint.map_or(Ok(Learned::default()), |(path, bytes)| {
+            let learned = py.detach(|| learners::from_bytes(&bytes));
+            learned.map_err(|error| refused(py, format!("checkpoint {path}: {error:#}")))
+        })?;
         let shape = shape_of(py, spec.height, spec.width)?;
         let kind_of_belief = estimator.unwrap_or_else(|| usual(&learned));
         let model = model(py, &spec, kind_of_belief)?;

@@ -25,17 +25,17 @@ WORLD: dict[str, Any] = {
 
 #: The estimator of each belief, and its prior.
 BELIEFS: dict[str, dict[str, Any]] = {
-    "known_model": {"estimator": "known"},
-    "known_model, initial": {"estimator": "known", "prior": "initial"},
-    "spatial_filter": {"estimator": "known+spatial"},
-    "spatial_filter, initial": {"estimator": "known+spatial", "prior": "initial"},
-    "learned_filter": {"checkpoint": "learned_filter"},
-    "learned_spatial_filter": {
+    "known": {"estimator": "known"},
+    "known, initial": {"estimator": "known", "prior": "initial"},
+    "known+spatial": {"estimator": "known+spatial"},
+    "known+spatial, initial": {"estimator": "known+spatial", "prior": "initial"},
+    "learned": {"checkpoint": "learned_filter"},
+    "learned+spatial": {
         "checkpoint": "learned_filter",
         "estimator": "learned+spatial",
     },
-    "learned_filter, own kernels": {"checkpoint": "own_kernels"},
-    "neural_belief": {"checkpoint": "neural_belief"},
+    "learned, own kernels": {"checkpoint": "own_kernels"},
+    "neural": {"checkpoint": "neural_belief"},
 }
 
 N_STEPS = 12

@@ -71,4 +71,3 @@ def test_other_encodings_are_refused_by_name(tmp_path: Path) -> None:
         Task.named(file)
     text = Path(LIVELY).read_text("utf-8")
     assert Model.from_toml("\ufeff" + text) == Model.from_toml(text)
-    assert Task.from_toml("\ufeff" + TASK) == Task.from_toml(TASK)

@@ -203,7 +203,7 @@ IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
     *(({"truth": it}, f"truth: expected bool, got {it!r}") for it in ("no", None)),
     ({"takeover": 1}, "takeover: expected bool, got 1"),
     ({"instance": 5}, r"instance: expected str \| None, got 5"),
-    ({"model": 5}, r"model: expected str \| Path \| None, got 5"),
+    ({"model": 5}, r"model: expected Model \| str \| Path \| None, got 5"),
     ({"model": "nowhere.toml"}, r"model file nowhere\.toml: No such .*expected a file, or one of "),
     ({"timeout": None}, "timeout: expected float, got None"),
     *(

@@ -90,7 +90,8 @@ def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArra
         airspace=Airspace(),
     )
     path = None if checkpoint is None else str(checkpoint)
-    options = _native.Options(spec, N_WORLDS, kind, path, "simulated", None)
+    read = None if path is None else (path, _native.checkpoint_bytes(path))
+    options = _native.Options(spec, N_WORLDS, kind, read, "simulated", None)
     worlds = list(range(N_WORLDS))
     options.begin(worlds, [1000, 1001, 1002])
     for results, frames, _ in flown:

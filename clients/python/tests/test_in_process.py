@@ -1,6 +1,9 @@
 """Worlds in this process need nothing outside, survive forks, and behave like a server's."""
 
+import copy
 import os
+import pickle
+import shutil
 import signal
 import sys
 import time
@@ -9,24 +12,29 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from environments import (
     FLAGS,
     MOVES,
     OBJECTIVE,
+    RECORDED,
     SMALL,
+    WILDFIRE,
     assert_same,
     closed_later,
     make,
     make_vec,
+    rollout,
     small_server,
 )
-from failures import fails
+from failures import fails, refuses
 from processes import asleep, isolated, script
 
 import emberwatch
 from emberwatch.errors import EmberwatchError, LeaseLostError, ServerGoneError
+from emberwatch.model import Model
 
 
 def make_team(**keywords: Any) -> Any:
@@ -268,3 +276,76 @@ def test_ctrl_c_ends_a_burn_in() -> None:
     started.signal(signal.SIGINT)
     code, out, err = started.end()
     assert (code, out.split()) == (0, ["interrupted", "closed", "closed"]), err
+
+
+def write_files(folder: Path) -> None:
+    """Writes a model with a map in a file of its own, a task with it, and recorded states."""
+    no_fly = 'no_fly = "closed.npy"\n'
+    (folder / "model.toml").write_text(no_fly + Model.named("wildfire-small").toml)
+    np.save(folder / "closed.npy", np.eye(7, 5, 2, np.uint8))
+    worlds = "height = 7\nwidth = 5\nmoves = 6\nburn_in = 20\nmax_steps = 9\n"
+    seeds = "test_seeds = { start = 0, end = 2 }\n"
+    (folder / "task.toml").write_text(f'name = "mine"\nmodel = "model.toml"\n{worlds}{seeds}')
+    np.savez(folder / "lab.npz", np.random.default_rng(5).integers(0, 3, (9, 4, 4), np.uint8))
+    shutil.copy(RECORDED, folder / "lab.toml")
+
+
+#: Keywords that name files of `write_files`.
+OF_FILES: dict[str, dict[str, Any]] = {
+    "model": {**SMALL, "model": "model.toml"},
+    "task": {"task": "task.toml"},
+    "states": {"states": "lab.npz", "n_moves": 6},
+}
+
+
+def of_files(of: str, kind: str) -> Any:
+    if kind == "path":
+        return closed_later(gymnasium.make(WILDFIRE, **OF_FILES[of]))
+    return closed_later(gymnasium.make_vec(MOVES, num_envs=2, **OF_FILES[of]))
+
+
+@pytest.mark.parametrize("of", OF_FILES)
+@pytest.mark.parametrize("kind", ["path", "moves"])
+def test_files_are_read_once(
+    of: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    env, reference = (of_files(of, kind) for _ in range(2))
+    twin, pickled = copy.deepcopy(env), pickle.dumps(env)
+    expected = rollout(reference, 8, seed=1001)
+    monkeypatch.chdir("/")
+    assert_same(rollout(pickle.loads(pickled), 8, seed=1001), expected)
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"changed")
+    for again in (env, twin):
+        for _ in range(2):
+            assert_same(rollout(again, 8, seed=1001), expected)
+            again.close()
+    with refuses("model|task|states"):
+        pickle.loads(pickled)
+
+
+def test_a_copy_in_another_process_refuses_changed_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    pickled = pickle.dumps(of_files("model", "path"))
+    (tmp_path / "model.toml").write_text(Model.named("wildfire").toml)
+    with refuses("the file of their task, model or states has changed since they were made"):
+        pickle.loads(pickled)
+
+
+def test_a_model_is_given_as_such_or_as_text() -> None:
+    model = Model.named("wildfire-small")
+    worlds = {**SMALL, "model": "wildfire-small"}
+    expected = rollout(make(**worlds), 8, seed=1)
+    for given in (model, model.toml):
+        env = make(**{**worlds, "model": given})
+        assert env.unwrapped.model == model
+        assert_same(rollout(env, 8, seed=1), expected)
+        again = closed_later(type(env.spec).from_json(env.spec.to_json()).make())
+        assert_same(rollout(again, 8, seed=1), expected)
+    with emberwatch.embed(model=model, height=16, width=16) as client:
+        assert client.info.model is not None

@@ -61,8 +61,8 @@ pub struct ServerConfig {
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
-    /// Name of the task that set the worlds' settings, if any.
-    pub task: Option<String>,
+    /// The task that set the worlds' settings, if any.
+    pub task: Option<Task>,
     /// The model, which has no transitions if the worlds show recorded states.
     pub model: Model,
     pub shape: Shape,
@@ -153,6 +153,19 @@ impl Default for ServerConfig {
     }
 }
 
+impl Checked {
+    /// Returns the same settings with another number of worlds.
+    ///
+    /// # Errors
+    /// If there would be too many worlds, or too many robots in all worlds.
+    pub fn with_worlds(mut self, worlds: u32) -> Result<Self, ConfigError> {
+        self.config.worlds = worlds;
+        self.config.check_ranges()?;
+        self.config.check_robots(self.shape)?;
+        Ok(self)
+    }
+}
+
 impl ServerConfig {
     /// Checks all settings and loads the files named in them.
     ///
@@ -180,7 +193,7 @@ impl ServerConfig {
                 got: cell.to_string(),
             });
         }
-        let model = model.map_or_else(|| self.read_model(), Ok)?;
+        let model = model.map_or_else(|| model_named(&self.model), Ok)?;
         let model = match usize::try_from(self.sensor_radius) {
             Ok(radius) => model.with_radius(radius)?,
             Err(_) => model,
@@ -203,19 +216,19 @@ impl ServerConfig {
         })
     }
 
-    /// Copies the settings of the task, if there is one, and returns its name.
-    fn take_task(&mut self) -> Result<Option<String>, ConfigError> {
+    /// Copies the settings of the task, if there is one, and returns it.
+    fn take_task(&mut self) -> Result<Option<Task>, ConfigError> {
         if self.task.is_empty() {
             return Ok(None);
         }
         let task = Task::named(&self.task)?;
-        (self.model, self.states) = (task.model, task.states);
+        (self.model, self.states) = (task.model.clone(), task.states.clone());
         self.sensor_radius = task.sensor_radius;
         (self.states_symmetries, self.states_offset) = (task.states_symmetries, task.states_offset);
         (self.height, self.width) = (task.height, task.width);
         (self.moves, self.robots) = (task.moves, task.robots);
         (self.burn_in, self.max_steps, self.start) = (task.burn_in, task.max_steps, task.start);
-        Ok(Some(task.name))
+        Ok(Some(task))
     }
 
     fn check_ranges(&self) -> Result<(), ConfigError> {
@@ -293,25 +306,30 @@ impl ServerConfig {
         };
         Ok((file.model, states))
     }
+}
 
-    fn read_model(&self) -> Result<Model, ConfigError> {
-        if let Some(model) = Model::built_in(&self.model) {
-            return Ok(model);
-        }
-        let path = Path::new(&self.model);
-        Model::read(path).map_err(|error| match error {
-            // The missing path may be a mistyped name of a built-in model.
-            ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
-                let names = listed(Model::built_in_names());
-                let problem = format!("{problem}: expected a file, or one of {names}");
-                file_error("model file", path, problem)
-            }
-            ModelError::File { path: of, problem } if Path::new(&of) == path => {
-                file_error("model file", path, problem)
-            }
-            other => file_error("model file", path, other),
-        })
+/// Returns the built-in model of this name, or the model of the file at this path. A text of several lines is itself
+/// the text of a model file.
+pub fn model_named(name: &str) -> Result<Model, ConfigError> {
+    if let Some(model) = Model::built_in(name) {
+        return Ok(model);
     }
+    if name.contains('\n') {
+        return Ok(Model::from_toml(name)?);
+    }
+    let path = Path::new(name);
+    Model::read(path).map_err(|error| match error {
+        // The missing path may be a mistyped name of a built-in model.
+        ModelError::File { path: of, problem } if Path::new(&of) == path && !path.exists() => {
+            let names = listed(Model::built_in_names());
+            let problem = format!("{problem}: expected a file, or one of {names}");
+            file_error("model file", path, problem)
+        }
+        ModelError::File { path: of, problem } if Path::new(&of) == path => {
+            file_error("model file", path, problem)
+        }
+        other => file_error("model file", path, other),
+    })
 }
 
 fn file_error(what: &'static str, path: &Path, problem: impl Display) -> ConfigError {

@@ -69,11 +69,36 @@ def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
 def explain(status: int, detail: int) -> tuple[str, str] | None:
     """Returns the name and the message of a status code; None if the code is not a refusal."""
 
-def check_settings(settings: str) -> str:
-    """Checks settings in JSON, and returns them with all defaults, as JSON."""
+@final
+class CheckedSettings:
+    """Settings of worlds in this process, with the files that they name, which are read only here.
 
-def worlds_fingerprint(settings: str) -> str:
-    """Returns the `worlds_fingerprint` of a server with these settings in JSON, without worlds."""
+    A pickle reads the files again, and refuses files that have changed.
+    """
+
+    def __new__(cls, settings: str) -> CheckedSettings:
+        """Reads and checks settings: JSON with the keys of `config/server.toml`.
+
+        Warns about start cells that no-fly cells enclose.
+        """
+
+    def with_worlds(self, worlds: int) -> CheckedSettings:
+        """Returns the same settings with another number of worlds."""
+
+    @property
+    def settings(self) -> str:
+        """All settings with their defaults, as JSON."""
+
+    @property
+    def description(self) -> str:
+        """Text of the model file with all maps, or of the description of recorded states."""
+
+    @property
+    def task(self) -> tuple[str, int, int, int, int, int, str] | None:
+        """Name, moves, robots, steps, first and end of the test seeds, and prefix of ids."""
+
+    @property
+    def worlds_fingerprint(self) -> str: ...
 
 _Numbers = tuple[float, bool, bool, int, int, NDArray[np.int64]]
 _Columns = tuple[
@@ -160,11 +185,8 @@ class Server:
         """Connects to a server; `client` names this program in the server's log."""
 
     @staticmethod
-    def embedded(settings: str, warns: bool) -> Server:
-        """Creates worlds in this process with settings of `config/server.toml`, as JSON.
-
-        If `warns` is set, warns about start cells that no-fly cells enclose.
-        """
+    def embedded(settings: CheckedSettings, seed: int | None = None) -> Server:
+        """Creates worlds in this process; `seed` replaces the first world's seed."""
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
         """Returns the hidden states of worlds in this process, as the fields of `Truth`.
@@ -203,11 +225,11 @@ class Options:
         spec: _Spec,
         n_worlds: int,
         estimator: str | None,
-        checkpoint: str | None,
+        checkpoint: tuple[str, bytes] | None,
         prior: str,
         watched: tuple[str, int] | None,
     ) -> None:
-        """Checks all arguments.
+        """Checks all arguments. `checkpoint`: the path, for errors, and the bytes of the file.
 
         `watched`: instance on which beliefs are published, and the number of world 0 there.
         """
@@ -409,17 +431,17 @@ class Recording:
 def estimator_names() -> list[tuple[str, str]]:
     """Returns the name and a description of each estimator that options can be planned with."""
 
+def checkpoint_bytes(path: str) -> bytes:
+    """Returns the bytes of a checkpoint; refuses folders, pipes and files that are too large."""
+
 def option_names() -> tuple[list[str], list[str]]:
     """Returns the names of the options, and of the features that describe each plan."""
 
 def read_model(text: str) -> dict[str, Any]:
     """Returns the fields of `Model` except `toml`; `ValueError` if the text is not a model file."""
 
-def grid_of_maps(path: str) -> tuple[int, int] | None:
-    """Returns height and width of a model file's maps; None if it is invalid or has no maps."""
-
-def model_text(path: str) -> str:
-    """Returns the text of a model file, including maps that are in separate files."""
+def model_text(name: str) -> str:
+    """Returns the text of a model with all maps, by its name, path, or the text of its file."""
 
 def model_with_radius(text: str, radius: int) -> str:
     """Returns the text of a model file with another sensor radius."""

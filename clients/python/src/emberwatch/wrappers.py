@@ -82,13 +82,12 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         kind: str | None = None,
         checkpoint: str | Path | None = None,
     ) -> None:
-        text = model.toml if isinstance(model, Model) else as_json(model)
         RecordConstructorArgs.__init__(
             self,
             keep=keep,
             dtype=dtype,
             prior=as_json(prior),
-            model=text,
+            model=as_json(model),
             kind=kind,
             checkpoint=as_json(checkpoint),
         )
@@ -180,10 +179,6 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
 
 def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) -> Model:
-    if isinstance(model, Model):
-        return model
-    if isinstance(model, str) and "\n" in model:
-        return Model.from_toml(model)
     if model is not None:
         return Model.named(model)
     revealed = getattr(env.unwrapped, "model", None)

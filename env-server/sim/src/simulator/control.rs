@@ -255,7 +255,7 @@ impl Simulator {
             observations: self.checked.model.observation_names(),
             model: (config.reveal_model && recorded.is_none())
                 .then(|| toml::to_string(file).expect("invariant: model files serialise")),
-            task: self.checked.task.clone(),
+            task: self.checked.task.as_ref().map(|task| task.name.clone()),
             worlds_fingerprint: Some(self.spec.settings.worlds_fingerprint()),
             airspace: airspace_info(&self.checked.model),
             zones: zones_info(&self.checked.model),

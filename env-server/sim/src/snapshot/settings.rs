@@ -84,7 +84,7 @@ impl Settings {
                 ("states_offset", text(&config.states_offset)),
             ]
         });
-        let task = checked.task.iter().map(|task| (TASK, task.clone()));
+        let task = checked.task.iter().map(|task| (TASK, task.name.clone()));
         let others = others.into_iter().chain(of_states).chain(task);
         Self {
             model: model.expect("invariant: a model was read from TOML"),

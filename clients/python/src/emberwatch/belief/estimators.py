@@ -54,7 +54,7 @@ def known(
             weights of all next states of a cell can be 0 at once.
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
-    model = model if isinstance(model, Model) else Model.named(model)
+    model = Model.named(model)
     numbers = distribution(prior, n_states=model.n_states).astype(np.float32)
     n = _n_worlds(n_worlds)
     native = _native.Estimators.known(model.toml, numbers, kind, n)
@@ -94,13 +94,11 @@ def load(
             grid or the model, or contains decisions trained on the belief of a known model.
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
-    if model is not None and not isinstance(model, Model):
-        model = Model.named(model)
     grid = tuple(
         as_count(side, name, 1, _native.MAX_SIDE)
         for side, name in ((height, "height"), (width, "width"))
     )
-    toml = None if model is None else model.toml
+    toml = None if model is None else Model.named(model).toml
     path, n = utf8("checkpoint", checkpoint), _n_worlds(n_worlds)
     native = _native.Estimators.load(path, (grid[0], grid[1]), kind, toml, n)
     return Belief(native, is_single=n_worlds is None)

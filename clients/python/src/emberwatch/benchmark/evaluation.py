@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -16,7 +15,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-import emberwatch._native as _native
 from emberwatch.belief.merit import RECENT_STEPS
 from emberwatch.benchmark.policies import Actor, Policy
 from emberwatch.benchmark.report import Progress
@@ -160,7 +158,7 @@ def _with_defaults(
         return keywords, info.n_robots, info.worlds_fingerprint or ""
     keywords.setdefault("truth", True)  # worlds in this process can always reveal it
     world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
-    fingerprint = _native.worlds_fingerprint(json.dumps(Settings(**world).of_server(1)))
+    fingerprint = Settings(**world).read().worlds_fingerprint
     return keywords, keywords.get("robots") or (task.robots if task else 1), fingerprint
 
 

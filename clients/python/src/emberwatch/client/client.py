@@ -4,14 +4,13 @@
 call waits at most `timeout` seconds for its answer. All returned arrays are copies.
 """
 
-import json
 import logging
 import os
 import sys
 import time
 from base64 import b64decode
-from collections.abc import Callable, Mapping
-from typing import Any, Final, TypeVar
+from collections.abc import Callable
+from typing import Final, TypeVar
 
 import emberwatch._native as _native
 from emberwatch.client import wire
@@ -28,16 +27,14 @@ from emberwatch.client.replies import (
     records,
 )
 from emberwatch.client.wire import StepAnswer
-from emberwatch.common.arguments import as_setting
+from emberwatch.common.arguments import read_settings
 from emberwatch.common.paths import utf8
 from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid
+from emberwatch.model import Model
 
 _Connection = TypeVar("_Connection")
 
 _log: Final = logging.getLogger("emberwatch")
-
-#: Milliseconds without use after which a lease on worlds in this process expires.
-_EMBEDDED_LEASE: Final = 86_400_000
 
 #: Seconds to sleep after the first attempt to connect, and maximum sleep between later attempts.
 _FIRST_RETRY: Final = 0.005
@@ -200,7 +197,7 @@ def connect(
     return connect_with_retry(wait, lambda: Client(instance, timeout=timeout))
 
 
-def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
+def embed(**settings: str | float | bool | os.PathLike[str] | Model | None) -> Client:
     """Creates worlds inside this process, without a server, and returns a `Client` of them.
 
     No other process can observe these worlds or fly in them, and closing the client ends them.
@@ -210,8 +207,8 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
 
     Args:
         settings: Settings of `config/server.toml`, such as `worlds=4`, `task="small"`, `seed=7`;
-            None: the default. The setting `instance` and the settings for a server's own snapshots
-            do not apply here.
+            None: the default. `model` may also be a `Model`. The setting `instance` and the
+            settings for a server's own snapshots do not apply here.
 
     Raises:
         InvalidArgumentError: If a setting is unknown or invalid.
@@ -219,20 +216,12 @@ def embed(**settings: str | float | bool | os.PathLike[str] | None) -> Client:
             `ulimit` allows.
         EmberwatchError: With code `"threads"` if the system cannot start threads.
     """
-    return embed_settings(settings, warns=True)
+    return embed_settings(read_settings(settings))
 
 
-def embed_settings(settings: Mapping[str, Any], *, warns: bool) -> Client:
-    """Does what `embed` does. `warns`: whether to warn about start cells that no-fly cells enclose.
-
-    Callers that have checked the settings pass False, because the check has already warned.
-    """
-    # The lease may be long, because no other client waits for these robots.
-    chosen: dict[str, object] = {"lease_millis": _EMBEDDED_LEASE}
-    for name, given in settings.items():
-        if given is not None:
-            chosen[name] = as_setting(name, given)
-    return Client("(embedded)", embedded=_native.Server.embedded(json.dumps(chosen), warns))
+def embed_settings(settings: _native.CheckedSettings, seed: int | None = None) -> Client:
+    """Does what `embed` does. `seed` is the first world's; None: the seed in the settings."""
+    return Client("(embedded)", embedded=_native.Server.embedded(settings, seed))
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:

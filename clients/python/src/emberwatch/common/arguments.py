@@ -18,21 +18,26 @@ from emberwatch.errors import invalid
 _Value = TypeVar("_Value")
 
 
-def check_settings(settings: Mapping[str, object]) -> dict[str, Any]:
-    """Checks settings; returns all settings and defaults by their names in `config/server.toml`.
+def read_settings(settings: Mapping[str, object]) -> _native.CheckedSettings:
+    """Checks settings by their names in `config/server.toml`, and reads the files that they name.
+
+    Settings that are None are left out.
 
     Raises:
         InvalidArgumentError: If a server would refuse them.
     """
-    return json.loads(_native.check_settings(json.dumps(settings)))
+    given = {name: as_setting(name, it) for name, it in settings.items() if it is not None}
+    return _native.CheckedSettings(json.dumps(given))
 
 
 def as_setting(name: str, value: object) -> bool | int | str:
-    """Converts the value of a setting to its JSON form."""
+    """Converts the value of a setting to its JSON form; a model becomes the text of its file."""
     if isinstance(value, np.generic):
         value = cast("object", value.item())
     if isinstance(value, bool | int):
         return value
+    if name == "model" and isinstance(text := getattr(value, "toml", None), str):
+        return text
     if isinstance(value, str | PathLike):
         return utf8(name, cast("str | PathLike[str]", value))
     raise invalid(name, "an integer, True or False, text or a path", repr_of(value))
@@ -126,6 +131,8 @@ def as_json(value: object) -> Any:
     """Converts a keyword's value to a form that `spec.to_json` can write, as Minari requires."""
     if isinstance(value, PathLike):
         return fspath(cast("PathLike[str]", value))
+    if isinstance(text := getattr(value, "toml", None), str):  # a model
+        return text
     if isinstance(value, np.generic | np.ndarray):
         return cast("NDArray[Any]", value).tolist()
     if isinstance(value, Enum):

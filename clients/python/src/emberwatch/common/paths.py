@@ -24,11 +24,6 @@ def utf8(subject: str, path: str | os.PathLike[str]) -> str:
     return text
 
 
-def local(text: str) -> str:
-    """Converts a UTF-8 path of another program to the text that Python opens in this locale."""
-    return os.fsdecode(text.encode())
-
-
 def shown(text: str) -> str:
     """Escapes characters that standard output cannot write, for example in undecodable paths."""
     encoding = sys.stdout.encoding or "utf-8"

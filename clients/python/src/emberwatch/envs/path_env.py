@@ -119,7 +119,8 @@ class WildfireEnv(WorldEnv):
       (`docs/environments/index.md` lists tasks and models). A task determines `robots`, all
       keywords from `model` to `states_offset`, and the length of episodes, so none of them may be
       given with it. With `instance`, it must be the task of the running server.
-    * `model`: the name of a built-in model (`"wildfire"`) or the path of a model file.
+    * `model`: a `Model`, the name of a built-in one (`"wildfire"`), or the path or the text of a
+      model file. All files are read once, when the environment is made.
     * `height`, `width` (64), `n_moves` (64; the T above), `burn_in` (10,000), `sensor_radius`
       (None: the model's), `start` (`"corner"`; or `"centre"`, `"random"`, `"ROW,COL"`): for worlds
       in this process. With `instance`, leave them out or repeat the server's values.

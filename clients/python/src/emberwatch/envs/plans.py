@@ -64,7 +64,9 @@ class Plans:
                 raise invalid(name, expected, repr_of(value))
         self._session = session
         path = None if checkpoint is None else utf8("checkpoint", checkpoint)
-        self._arguments = estimator, path, prior
+        # The bytes, because the file may change or move before a reset makes the beliefs again.
+        read = None if path is None else (path, _native.checkpoint_bytes(path))
+        self._arguments = estimator, read, prior
         #: The action space of one world.
         self.action_space: Final = spaces.Discrete(len(OBJECTIVES))
         shape = len(OBJECTIVES), len(FEATURES)

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emberwatch._native import CheckedSettings
 from emberwatch.client import wire
 from emberwatch.client.client import Client, connect, embed_settings
 from emberwatch.client.connection import RESET_TIMEOUT
@@ -88,6 +89,8 @@ class Session:
         self._asked_rows = n_rows
         self._client: Client | None = None
         self._lease: Lease | None = None
+        #: The settings of worlds in this process, with the files that they name.
+        self._own: CheckedSettings | None = None
         self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
         self._state = State.CLOSED
@@ -99,7 +102,7 @@ class Session:
         #: Number of world steps that the last answer skipped, because a path came too late.
         self.n_skipped = 0
         if settings.instance is None:
-            self.spec, self._robots = own_spec(settings, n_rows)
+            self.spec, self._robots, self._own = own_spec(settings, n_rows)
         else:
             with self._connect(settings.instance) as client:
                 self.spec, self._robots = running_spec(settings, n_rows, client.info)
@@ -284,8 +287,8 @@ class Session:
         self.close()  # an interrupted call may have left parts open
         try:
             if settings.instance is None:
-                chosen = {"seed": seed, **settings.of_server(self.n_worlds)}
-                self._client = client = embed_settings(chosen, warns=False)
+                assert self._own is not None
+                self._client = client = embed_settings(self._own, seed)
                 self._truth = Present(client.truths) if settings.truth else None
             else:
                 self._client = client = self._connect(settings.instance)

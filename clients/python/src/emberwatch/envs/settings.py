@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
@@ -14,8 +17,8 @@ import emberwatch._native as _native
 from emberwatch.client.connection import STEP_TIMEOUT
 from emberwatch.client.replies import ServerInfo
 from emberwatch.client.wire import Shape
-from emberwatch.common.arguments import as_setting, check_settings
-from emberwatch.common.paths import local, utf8
+from emberwatch.common.arguments import read_settings
+from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace, Zones
@@ -50,7 +53,7 @@ class WorldArguments(TypedDict, total=False):
     robots: int | None
     takeover: bool
     task: str | Path | None
-    model: str | Path | None
+    model: Model | str | Path | None
     states: str | Path | None
     states_symmetries: bool
     states_offset: int
@@ -75,7 +78,7 @@ class Settings:
     robots: int | None = None
     takeover: bool = False
     task: str | Path | None = None
-    model: str | Path | None = None
+    model: Model | str | Path | None = None
     states: str | Path | None = None
     states_symmetries: bool = False
     states_offset: int = 0
@@ -104,8 +107,9 @@ class Settings:
             if not is_kind or (isinstance(value, bool) and kind is not bool):
                 raise invalid(each.name, each.type, repr(value))
         for name in ("task", "model", "states", "start"):
-            if getattr(self, name) is not None:
-                utf8(name, getattr(self, name))
+            value = getattr(self, name)
+            if isinstance(value, str | Path):
+                utf8(name, value)
         if self.sensor_radius is not None and not 0 <= self.sensor_radius <= _native.MAX_RADIUS:
             expected = f"0 to {_native.MAX_RADIUS}, or None"
             raise invalid("sensor_radius", expected, self.sensor_radius)
@@ -137,10 +141,9 @@ class Settings:
         asked = cls(**world)
         return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
 
-    def of_server(self, n_worlds: int) -> dict[str, Any]:
-        """Returns the settings for `n_worlds` worlds, by their names in `config/server.toml`."""
+    def read(self) -> _native.CheckedSettings:
+        """Checks the settings of one world, and reads their files. Errors name keywords."""
         given = {
-            "worlds": n_worlds,
             "robots": self.robots,
             "task": self.task,
             "model": self.model,
@@ -157,16 +160,19 @@ class Settings:
             "states_symmetries": self.states_symmetries or None,
             "states_offset": self.states_offset or None,
         }
-        return {name: as_setting(name, it) for name, it in given.items() if it is not None}
+        with _names_keywords():
+            return read_settings(given)
 
-    def check(self, n_worlds: int) -> dict[str, Any]:
-        """Checks the settings, and returns them with all defaults. Errors name keywords."""
-        try:
-            return check_settings(self.of_server(n_worlds))
-        except InvalidArgumentError as error:
-            setting, colon, words = str(error).partition(":")
-            words = f"{_KEYWORDS.get(setting, setting)}{colon}{words}"
-            raise InvalidArgumentError(words) from None
+
+@contextmanager
+def _names_keywords() -> Generator[None]:
+    """Replaces the setting that an error names by its keyword."""
+    try:
+        yield
+    except InvalidArgumentError as error:
+        setting, colon, words = str(error).partition(":")
+        words = f"{_KEYWORDS.get(setting, setting)}{colon}{words}"
+        raise InvalidArgumentError(words) from None
 
 
 def shows_keywords(init: _Init) -> _Init:
@@ -231,8 +237,10 @@ def draw_seed(generator: np.random.Generator) -> int:
     return int(generator.integers(SEEDS))
 
 
-def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
-    """Returns the spec of the worlds that this process will simulate, and the robots' numbers.
+def own_spec(
+    settings: Settings, n_rows: int | None
+) -> tuple[WorldSpec, range, _native.CheckedSettings]:
+    """Returns the spec, the robots' numbers and the settings of worlds in this process.
 
     `n_rows` is the number of robots; None: all robots of one world.
     """
@@ -243,11 +251,13 @@ def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
                 f"{name}: applies only with instance=..., the name of a running server; without "
                 "it, the environment simulates its own worlds"
             )
-    task = None if settings.task is None else Task.named(settings.task)
-    n_robots = settings.robots or (1 if task is None else task.robots)
+    read = settings.read()
+    checked: dict[str, Any] = json.loads(read.settings)
+    n_robots: int = checked["robots"]
     robots = _robots(settings, n_rows, n_robots)
-    checked = settings.check(len(robots) // n_robots)
-    described = _described(checked)
+    with _names_keywords():
+        read = read.with_worlds(len(robots) // n_robots)
+    described = _described(read, checked)
     spec = WorldSpec(
         model=described if isinstance(described, Model) else None,
         height=checked["height"],
@@ -257,12 +267,12 @@ def own_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
         burn_in=checked["burn_in"],
         airspace=described.airspace,
         zones=described.zones if isinstance(described, Model) else None,
-        n_robots=checked["robots"],
+        n_robots=n_robots,
         is_recorded=bool(checked["states"]),
         description=described if checked["states"] else None,
-        task=task,
+        task=Task.of(read),
     )
-    return spec, robots
+    return spec, robots, read
 
 
 def running_spec(
@@ -325,16 +335,18 @@ def running_spec(
 
 def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     """Returns the task; refuses a server of another task, or with worlds that differ from it."""
-    task = Task.named(asked)
+    read = read_settings({"task": asked})
+    task = Task.of(read)
+    assert task is not None
     if task.name != info.task:
         raise invalid("task", f"the server's {info.task!r}, or None", repr(task.name))
-    own = check_settings({"task": utf8("task", asked)})
+    own: dict[str, Any] = json.loads(read.settings)
     has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
     has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}
     for name, got in has.items():
         if own[name] != got:
             raise invalid(f"{name} of task {task.name!r}", f"the server's {got}", own[name])
-    described = _described(own)
+    described = _described(read, own)
     if described.sensor_radius != info.airspace.radius:
         expected = f"the server's {info.airspace.radius}"
         name = f"sensor_radius of task {task.name!r}"
@@ -349,24 +361,12 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     return task
 
 
-def _described(checked: dict[str, Any]) -> Description:
-    """Returns the model that checked settings name, or the description of their recorded states."""
-    if checked["states"]:
-        described: Description = _description(local(checked["states"]))
-    else:
-        described = Model.checked(local(checked["model"]))
-    radius = checked["sensor_radius"]
+def _described(read: _native.CheckedSettings, checked: dict[str, Any]) -> Description:
+    """Returns the model of settings, or the description of their recorded states."""
+    if not checked["states"]:
+        return Model.from_toml(read.description)
+    described, radius = Description.from_toml(read.description), checked["sensor_radius"]
     return described.with_radius(radius) if radius >= 0 else described
-
-
-def _description(states: str) -> Description:
-    """Returns the description of a states file that has been checked."""
-    text = _native.built_in("states").get(states)
-    if text is None:
-        place = Path(states)
-        path = place / "states.toml" if place.is_dir() else place.with_suffix(".toml")
-        text = path.read_text("utf-8")
-    return Description.from_toml(text)
 
 
 def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:

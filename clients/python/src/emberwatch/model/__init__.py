@@ -6,16 +6,16 @@ ones. `emberwatch.belief` applies the parameters to a belief.
 """
 
 from dataclasses import dataclass, fields
-from os import PathLike, fspath
+from os import PathLike
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 import emberwatch._native as _native
-from emberwatch.common.arguments import as_count, check_settings
+from emberwatch.common.arguments import as_count
 from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.model.airspace import Airspace, Zones
 
 Color = tuple[int, int, int]
@@ -139,38 +139,22 @@ class Model(Description):
     """The zone of each cell, shape (H, W); None if the model has no zones."""
 
     @classmethod
-    def named(cls, name: str | PathLike[str]) -> Self:
-        """Returns a built-in model by its name, or the model of a file, which is checked first.
+    def named(cls, model: "Model | str | PathLike[str]") -> "Model":
+        """Returns a model: a built-in one by its name, or by the path or the text of its file.
+
+        A `Model` is returned as it is.
 
         Raises:
             InvalidArgumentError: If there is no such model, or the file has an error.
         """
-        settings = {"model": utf8("model", name)}
-        try:
-            check_settings(settings)
-        except InvalidArgumentError:
-            grid = _native.grid_of_maps(fspath(name))
-            if grid is None:
-                raise
-            check_settings({**settings, "height": grid[0], "width": grid[1]})
-        return cls.checked(name)
-
-    @classmethod
-    def checked(cls, name: str | PathLike[str]) -> Self:
-        """Returns the same model as `named`, for a name or file that has already been checked."""
-        text = _native.built_in("models").get(fspath(name))
-        if text is not None:
-            return cls.from_toml(text)
-        try:
-            text = _native.model_text(fspath(name))
-        except ValueError as error:  # the file has changed since the check
-            raise InvalidArgumentError(f"model: {error}") from None
-        return cls.from_toml(text)
+        if isinstance(model, Model):
+            return model
+        return cls.from_toml(_native.model_text(utf8("model", model)))
 
     @classmethod
     def wildfire(cls) -> Self:
         """Returns the built-in model `wildfire`, from section II of the paper."""
-        return cls.checked("wildfire")
+        return cls.from_toml(_native.built_in("models")["wildfire"])
 
     @property
     def zones(self) -> Zones | None:

@@ -1,14 +1,11 @@
 """Tasks: named, completely specified worlds, with the seeds to test on."""
 
-import tomllib
-from dataclasses import dataclass
-from os import PathLike, fspath
-from pathlib import Path
+from dataclasses import dataclass, field
+from os import PathLike
 from typing import Self
 
 import emberwatch._native as _native
-from emberwatch.common.arguments import check_settings
-from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
+from emberwatch.common.arguments import read_settings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,30 +22,31 @@ class Task:
     test_seeds: range
     #: Prefix of the ids of its environments, such as `WildfireSmall` in
     #: `emberwatch/WildfireSmall-v0`; empty if it has no environments.
-    ids: str = ""
+    ids: str = field(default="", compare=False)
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
-        """Returns a built-in task by its name, or the task of a file, which is checked first."""
-        check_settings({"task": utf8("task", name)})
-        text = _native.built_in("tasks").get(fspath(name))
-        return cls.from_toml(Path(name).read_text("utf-8") if text is None else text)
+        """Returns a built-in task by its name, or the task of a file, with its files checked."""
+        task = cls.of(read_settings({"task": name}))
+        assert task is not None
+        return task
 
     @classmethod
-    def from_toml(cls, text: str) -> Self:
-        """Parses the text of a file that has been checked."""
-        file = tomllib.loads(text.removeprefix(BYTE_ORDER_MARK))
+    def of(cls, settings: _native.CheckedSettings) -> Self | None:
+        """Returns the task of settings; None if they have no task."""
+        if settings.task is None:
+            return None
+        name, n_moves, robots, max_steps, start, end, ids = settings.task
         return cls(
-            name=file["name"],
-            n_moves=file["moves"],
-            robots=file.get("robots", 1),
-            max_steps=file["max_steps"],
-            test_seeds=range(file["test_seeds"]["start"], file["test_seeds"]["end"]),
-            ids=file.get("listing", {}).get("ids", ""),
+            name=name,
+            n_moves=n_moves,
+            robots=robots,
+            max_steps=max_steps,
+            test_seeds=range(start, end),
+            ids=ids,
         )
 
 
 def built_in_tasks() -> dict[str, Task]:
     """Returns the built-in tasks by name."""
-    files = _native.built_in("tasks").items()
-    return {name: Task.from_toml(text) for name, text in files}
+    return {name: Task.named(name) for name in _native.built_in("tasks")}
