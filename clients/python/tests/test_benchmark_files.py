@@ -228,3 +228,11 @@ def test_worlds_that_change_during_a_run_are_refused(tmp_path: Path) -> None:
     changed = text.replace("name = ", "name = 'other' # ", 1)
     with refuses("worlds: changed since the evaluation began"):
         go(None, policy=after(0, lambda: model.write_text(changed)), model=model)
+
+
+def test_a_policy_may_change_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.toml").write_bytes(Path(LIVELY).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    moves = after(3, partial(monkeypatch.chdir, "/"))
+    rows = go("rows.csv", policy=moves, model="mine.toml")
+    assert len(read(tmp_path / "rows.csv")) == len(rows) > 1

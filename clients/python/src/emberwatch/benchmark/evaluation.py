@@ -23,6 +23,7 @@ from emberwatch.benchmark.tally import Tally
 from emberwatch.client import wire
 from emberwatch.client.client import Client
 from emberwatch.common.arguments import as_count, as_list, as_seed, repr_of
+from emberwatch.common.paths import absolute
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
 from emberwatch.envs.settings import Settings, WorldArguments
 from emberwatch.errors import InvalidArgumentError, invalid
@@ -151,6 +152,8 @@ def _with_defaults(
         burn_in = 25_000
     # Hidden states can arrive late on a busy machine.
     keywords = {"timeout": 30.0, **keywords, "burn_in": burn_in}
+    for name in {"task", "model", "states", "checkpoint"} & keywords.keys():
+        keywords[name] = absolute(keywords[name])
     if keywords.get("instance") is not None:
         with Client(keywords["instance"]) as client:
             info = client.info

@@ -12,6 +12,7 @@ from emberwatch.benchmark.evaluation import evaluate
 from emberwatch.benchmark.policies import Policy
 from emberwatch.benchmark.rows import Row, check_writable
 from emberwatch.common.arguments import as_count, repr_of
+from emberwatch.common.paths import absolute
 from emberwatch.errors import ExistingFileError, invalid
 from emberwatch.model.tasks import Task, built_in_tasks
 
@@ -48,7 +49,7 @@ def suite(
     sources = list(policies or built_in_tasks() if tasks is None else tasks)
     if not sources:
         raise invalid("tasks", "at least one task", "none")
-    chosen = [(source, Task.named(source)) for source in sources]
+    chosen = [(absolute(source), Task.named(source)) for source in sources]
     names = [task.name for _, task in chosen]
     if len(set(names)) < len(names):
         raise invalid("tasks", "tasks with different names", ", ".join(names))
@@ -56,7 +57,7 @@ def suite(
     for task in names:
         if policies is not None and task not in policies:
             raise invalid("policy", f"one for the task {task}", ", ".join(policies))
-        files[task] = Path(folder, task, re.sub("[/+]", "_", name) + ".csv")
+        files[task] = Path(os.path.abspath(folder), task, re.sub("[/+]", "_", name) + ".csv")
         if os.path.lexists(files[task]):
             raise ExistingFileError(
                 f"folder: {files[task]} already exists: remove it, choose another name or folder, "

@@ -2,8 +2,9 @@
 
 import os
 import sys
-from typing import Final
+from typing import Any, Final, cast
 
+import emberwatch._native as _native
 from emberwatch.errors import invalid
 
 #: Character that editors on Windows write at the beginning of UTF-8 text.
@@ -22,6 +23,15 @@ def utf8(subject: str, path: str | os.PathLike[str]) -> str:
         expected = "UTF-8, and a locale that has its letters, such as LC_ALL=C.UTF-8"
         raise invalid(subject, expected, ascii(os.fspath(path)))
     return text
+
+
+def absolute(name: Any) -> Any:
+    """Makes the path of a file absolute, as a policy may change the folder; other values stay."""
+    if not isinstance(name, (str, os.PathLike)):
+        return name
+    path = os.fspath(cast("str | os.PathLike[str]", name))
+    is_built_in = any(path in _native.built_in(kind) for kind in ("models", "tasks", "states"))
+    return os.path.abspath(path) if os.path.exists(path) and not is_built_in else path
 
 
 def shown(text: str) -> str:
