@@ -22,6 +22,8 @@ pub use self::neural::{NEURAL, NEURAL_SENSOR};
 pub use self::truth::{NONE, TRUTH};
 pub use self::world_form::WorldForm;
 
+use emberwatch_model::text::shortened;
+
 /// All kinds, ordered by how much they know about the world.
 pub const BELIEFS: &[&BeliefKind] = &[
     &NONE,
@@ -60,7 +62,11 @@ pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
     named(name).filter(serves).ok_or_else(|| {
         let kinds = BELIEFS.iter().copied().filter(serves);
         let names: Vec<&str> = kinds.map(|kind| kind.name).collect();
-        format!("expected one of {}, got {name:?}", names.join(", "))
+        format!(
+            "expected one of {}, got {:?}",
+            names.join(", "),
+            shortened(name)
+        )
     })
 }
 

@@ -11,6 +11,7 @@ use anyhow::{Context, Result, anyhow, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::Shape;
+use emberwatch_model::text::shortened;
 use emberwatch_network::NamedTensor;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
@@ -321,6 +322,8 @@ pub fn check(fits: bool, name: &str, expected: impl Display, got: impl Display) 
 
 /// Creates an error about a tensor or a field of the state.
 pub fn wrong(name: &str, expected: impl Display, got: impl Display) -> anyhow::Error {
+    let got = got.to_string();
+    let (name, got) = (shortened(name), shortened(&got));
     anyhow!("{name}: expected {expected}, got {got:#}")
 }
 

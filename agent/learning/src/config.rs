@@ -8,9 +8,10 @@ pub use sections::{
 };
 
 use self::sections::check;
-use anyhow::{Result, bail};
+use anyhow::{Result, anyhow, bail};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::Integration;
+use emberwatch_model::text::parse_problem;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
@@ -88,7 +89,10 @@ impl AgentConfig {
     /// If a setting is unknown or out of range. The error names the first such setting.
     pub fn from_toml(text: &str) -> Result<Self> {
         let mut settings: Table = DEFAULTS.parse()?;
-        replace(&mut settings, text.parse()?, "")?;
+        let given: Table = text
+            .parse()
+            .map_err(|error| anyhow!(parse_problem(error)))?;
+        replace(&mut settings, given, "")?;
         let config: Self = settings.try_into()?;
         config.check()?;
         Ok(config)

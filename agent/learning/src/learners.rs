@@ -20,6 +20,7 @@ use crate::checkpoint::{self, Contents};
 use crate::learned::Learned;
 use anyhow::{Context, Result, ensure};
 use emberwatch_model::built_in::listed;
+use emberwatch_model::text::shortened;
 use emberwatch_network::Device;
 use std::path::Path;
 
@@ -39,7 +40,10 @@ pub fn named(name: &str) -> Result<&'static LearnerKind, String> {
     let found = LEARNERS.iter().copied().find(|kind| kind.name == name);
     found.ok_or_else(|| {
         let names = listed(LEARNERS.iter().map(|kind| kind.name));
-        format!("learner: expected one of {names}, got {name:?}")
+        format!(
+            "learner: expected one of {names}, got {:?}",
+            shortened(name)
+        )
     })
 }
 

@@ -48,6 +48,12 @@ pub struct CheckedSettings {
     checked: Checked,
 }
 
+/// Name, moves, robots, steps, first and end of the test seeds, and prefix of the environments' ids.
+type TaskFields<'a> = (&'a str, usize, u32, u64, u64, u64, &'a str);
+
+/// A call that makes a copy: the function and its arguments.
+type Copying<'a, 'py> = (Bound<'py, PyAny>, (&'a str, u32, String));
+
 #[pymethods]
 impl CheckedSettings {
     /// Reads and checks settings, given as JSON with the keys of `config/server.toml`. Warns about robots whose start
@@ -84,9 +90,9 @@ impl CheckedSettings {
         }
     }
 
-    /// The task's name, moves, robots, steps and test seeds.
+    /// `None` if the settings have no task.
     #[getter]
-    fn task(&self) -> Option<(&str, usize, u32, u64, u64, u64, &str)> {
+    fn task(&self) -> Option<TaskFields<'_>> {
         let task = self.checked.task.as_ref()?;
         let ids = task.listing.as_ref().map_or("", |listing| &listing.ids);
         let Range { start, end } = task.test_seeds;
@@ -103,10 +109,7 @@ impl CheckedSettings {
         slf
     }
 
-    fn __reduce__<'py>(
-        &self,
-        py: Python<'py>,
-    ) -> PyResult<(Bound<'py, PyAny>, (&str, u32, String))> {
+    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<Copying<'_, 'py>> {
         let again = py.import("emberwatch._native")?.getattr("read_again")?;
         let worlds = self.checked.config.worlds;
         Ok((again, (&self.given, worlds, self.worlds_fingerprint())))

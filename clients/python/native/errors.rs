@@ -4,6 +4,7 @@ use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::limits::memory::{self, NoMemory};
 use emberwatch_messages::limits::threads::NoThreads;
+use emberwatch_model::text::shortened;
 use emberwatch_sim::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyUserWarning};
@@ -113,7 +114,11 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
             .unwrap_or_else(|| PyKeyboardInterrupt::new_err(())),
         ChannelError::InstanceName(name) => {
             let expected = "1 to 64 characters from A-Z a-z 0-9 - _";
-            error(py, "invalid", ("instance", expected, format!("'{name}'")))
+            error(
+                py,
+                "invalid",
+                ("instance", expected, format!("'{}'", shortened(&name))),
+            )
         }
         ChannelError::NoServer { instance } => {
             let remedy = format!("start one with `emberwatch-server --instance {instance}`");

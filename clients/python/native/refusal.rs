@@ -2,6 +2,7 @@
 
 use crate::errors::error;
 use emberwatch_messages::message::Status;
+use emberwatch_model::text::shortened;
 use pyo3::prelude::*;
 use std::fmt::Display;
 
@@ -21,7 +22,8 @@ pub fn invalid(
     expected: impl Display,
     got: impl Display,
 ) -> PyErr {
-    let words = (subject.to_string(), expected.to_string(), got.to_string());
+    let got = shortened(&got.to_string()).into_owned();
+    let words = (subject.to_string(), expected.to_string(), got);
     error(py, "invalid", words)
 }
 

@@ -25,6 +25,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
 import emberwatch
+from emberwatch import belief
+from emberwatch.benchmark import evaluate
 from emberwatch.model import Model
 from emberwatch.wrappers import BeliefObservation
 
@@ -231,3 +233,52 @@ def test_documented_modules_can_be_imported() -> None:
     with pytest.raises(AttributeError, match="'emberwatch' has no attribute 'wrapers'"):
         emberwatch.wrapers  # noqa: B018
     assert WILDFIRE in gymnasium.registry
+
+
+#: Calls that are given a value of thousands of characters.
+GIVEN_LONG: dict[str, Callable[[Any], object]] = {
+    "model": lambda long: make(model=long),
+    "toml": lambda long: make(model=f"\n{long} = 1"),
+    "task": lambda long: gymnasium.make(WILDFIRE, task=long),
+    "states": lambda long: gymnasium.make(WILDFIRE, states=long),
+    "start": lambda long: make(start=long),
+    "height": lambda long: make(height=long),
+    "observation": lambda long: make(observation=long),
+    "reward": lambda long: make(reward=long),
+    "instance": lambda long: make(instance=long, timeout=0.01),
+    "options": lambda long: make().reset(options={long: True}),
+    "action": lambda long: closed_reset().step(long),
+    "setting": lambda long: emberwatch.embed(**{long: 1}),
+    "known": lambda long: belief.known(long, prior=np.ones((3, 4, 4)) / 3),
+    "kind": lambda long: belief.load("no", height=4, width=4, kind=long),
+    "policy": lambda long: evaluate(lambda seen: seen, name="mine", env=long),
+    "baseline": lambda long: make(OBJECTIVE, estimator=long),
+}
+
+
+def closed_reset() -> Any:
+    env = make()
+    env.reset(seed=1)
+    return env
+
+
+@pytest.mark.parametrize("long", ["x" * 9000, "word " * 2000, "\N{FIRE}" * 3000])
+@pytest.mark.parametrize("of", GIVEN_LONG)
+def test_a_refusal_quotes_little_of_a_long_value(of: str, long: str) -> None:
+    with pytest.raises((emberwatch.EmberwatchError, ValueError)) as refused:
+        GIVEN_LONG[of](long)
+    text = str(refused.value)
+    assert len(text) < 700, text
+    assert max(map(len, text.splitlines())) < 600, text
+
+
+def test_a_number_too_long_to_print_is_refused() -> None:
+    with refuses("n_moves"):
+        make(n_moves=10**5000)
+    with refuses("seed: expected an integer within 0 to 2"):
+        make().reset(seed=10**5000)
+
+
+def test_a_belief_of_recorded_worlds_needs_a_model() -> None:
+    with refuses("BeliefObservation: recorded worlds have no model. Pass model=: "):
+        BeliefObservation(gymnasium.make(WILDFIRE, task="jacksboro", observation="frame"))

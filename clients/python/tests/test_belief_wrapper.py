@@ -143,7 +143,7 @@ def test_priors_are_given_by_name_or_array() -> None:
 
 
 def test_a_hidden_model_must_be_passed(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="the server does not reveal .* Pass model="):
+    with pytest.raises(ValueError, match="does not reveal its model .* Pass model="):
         BeliefObservation(Stub(model=None))
     file = tmp_path / "model.toml"
     file.write_text(WILDFIRE.toml)

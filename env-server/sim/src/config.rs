@@ -11,7 +11,7 @@ use emberwatch_model::ModelError;
 use emberwatch_model::built_in::listed;
 use emberwatch_model::grid::ShapeError;
 use emberwatch_model::task::{Start, Task, TaskError};
-use emberwatch_model::text::read_text;
+use emberwatch_model::text::{parse_problem, read_text, shortened};
 use emberwatch_model::{Model, Shape};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Number, Value};
@@ -86,7 +86,7 @@ pub struct CheckedStates {
 #[non_exhaustive]
 pub enum ConfigError {
     /// An error in a file. `what` names the kind of file: `config file` or `model file`.
-    #[error("{what} {path}: {problem}")]
+    #[error("{what} {}: {problem}", shortened(path))]
     File {
         what: &'static str,
         path: String,
@@ -101,7 +101,7 @@ pub enum ConfigError {
     },
     /// An error in a setting given by name ([`ServerConfig::with`]): the name is unknown, the value is invalid, or a
     /// task or a states file already determines the setting.
-    #[error("{setting}: expected {expected}, got {got}")]
+    #[error("{}: expected {expected}, got {}", shortened(setting), shortened(got))]
     Given {
         setting: String,
         expected: String,
@@ -282,7 +282,7 @@ impl ServerConfig {
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
         let wrong = |error: &dyn Display| file_error("config file", path, error);
         let text = read_text(path).map_err(|error| wrong(&error))?;
-        toml::from_str(&text).map_err(|error| wrong(&error))
+        toml::from_str(&text).map_err(|error| wrong(&parse_problem(error)))
     }
 
     /// Reads the states file and replaces the settings that it determines: grid, burn-in and model.

@@ -6,7 +6,7 @@
 
 use emberwatch_model::built_in::STATES;
 use emberwatch_model::grid::Shape;
-use emberwatch_model::text::read_text;
+use emberwatch_model::text::{parse_problem, read_text, shortened};
 use emberwatch_model::{Description, Model};
 use ndarray::{Array3, ShapeBuilder};
 use ndarray_npy::npy::header::Header;
@@ -53,7 +53,7 @@ pub struct Sequences {
 
 /// An error in a states file.
 #[derive(Debug, Error)]
-#[error("states file {path}: {problem}")]
+#[error("states file {}: {problem}", shortened(path))]
 pub struct StatesError {
     path: String,
     problem: String,
@@ -124,7 +124,10 @@ impl Sequences {
         names.sort_by(|a, b| bare(a).cmp(bare(b)));
         for name in &names {
             if !name.ends_with(".npy") {
-                return Err(format!("expected only .npy members, got {name:?}"));
+                return Err(format!(
+                    "expected only .npy members, got {:?}",
+                    shortened(name)
+                ));
             }
             let member = archive
                 .by_name(name)
@@ -263,7 +266,8 @@ fn read_description(path: &Path) -> anyhow::Result<(Description, Model)> {
 }
 
 fn described(text: &str) -> anyhow::Result<(Description, Model)> {
-    let description: Description = toml::from_str(text)?;
+    let description: Result<Description, _> = toml::from_str(text);
+    let description = description.map_err(|error| anyhow::anyhow!(parse_problem(error)))?;
     let model = description.unchanging()?;
     Ok((description, model))
 }

@@ -2,6 +2,7 @@
 
 use crate::limits::memory::NoMemory;
 use crate::message::{Status, VERSION};
+use emberwatch_model::text::shortened;
 use std::fmt::Debug;
 use std::time::Duration;
 use thiserror::Error;
@@ -11,7 +12,10 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum ChannelError {
     /// The name of an instance is invalid.
-    #[error("instance name: expected 1 to 64 letters, digits, '-' or '_', got {0:?}")]
+    #[error(
+        "instance name: expected 1 to 64 letters, digits, '-' or '_', got {:?}",
+        shortened(_0)
+    )]
     InstanceName(String),
     /// The directory for the channels' files cannot be used.
     #[error("channel directory {path}: {problem}")]

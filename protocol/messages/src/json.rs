@@ -1,6 +1,7 @@
 //! Parses the JSON requests of `control`.
 
 use super::codes::Status;
+use emberwatch_model::text::parse_problem;
 use serde::de::DeserializeOwned;
 
 /// Maximum size of a control message in bytes: 1 MiB.
@@ -22,7 +23,7 @@ pub fn parse<T: DeserializeOwned>(text: &[u8]) -> Result<T, String> {
         )));
     }
     serde_json::from_slice(text).map_err(|error| {
-        let reason = error.to_string();
+        let reason = parse_problem(error);
         malformed(reason.chars().take(MAX_REASON).collect())
     })
 }

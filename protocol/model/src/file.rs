@@ -2,7 +2,7 @@
 
 use super::cell_map::CellMap;
 use super::grid::{Cell, Shape};
-use crate::text::read_text;
+use crate::text::{parse_problem, read_text, shortened};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use thiserror::Error;
@@ -132,7 +132,10 @@ pub enum ModelError {
     #[error("model file: {0}")]
     Toml(String),
     /// There are too few or too many states or observations.
-    #[error("model {model:?}: expected {least} to {most} {what}, got {got}")]
+    #[error(
+        "model {:?}: expected {least} to {most} {what}, got {got}",
+        shortened(model)
+    )]
     Count {
         /// The model's name.
         model: String,
@@ -146,7 +149,11 @@ pub enum ModelError {
         got: usize,
     },
     /// Two entries have the same name.
-    #[error("model {model:?}: {what} name {name:?} appears twice")]
+    #[error(
+        "model {:?}: {what} name {:?} appears twice",
+        shortened(model),
+        shortened(name)
+    )]
     DuplicateName {
         /// The model's name.
         model: String,
@@ -156,7 +163,7 @@ pub enum ModelError {
         name: String,
     },
     /// A file cannot be read.
-    #[error("{path}: {problem}")]
+    #[error("{}: {problem}", shortened(path))]
     File {
         /// The file.
         path: String,
@@ -164,7 +171,11 @@ pub enum ModelError {
         problem: String,
     },
     /// A kernel entry names an unknown state.
-    #[error("model {model:?}: kernel entry names state {name:?}, expected one of {known:?}")]
+    #[error(
+        "model {:?}: kernel entry names state {:?}, expected one of {known:?}",
+        shortened(model),
+        shortened(name)
+    )]
     UnknownState {
         /// The model's name.
         model: String,
@@ -174,7 +185,11 @@ pub enum ModelError {
         known: Vec<String>,
     },
     /// An entry has a wrong value.
-    #[error("model {model:?}: {what}: expected {expected}, got {got}")]
+    #[error(
+        "model {:?}: {what}: expected {expected}, got {}",
+        shortened(model),
+        shortened(got)
+    )]
     Value {
         /// The model's name.
         model: String,
@@ -219,7 +234,7 @@ pub enum ModelError {
 impl From<toml::de::Error> for ModelError {
     /// Adds advice if the text contains a key of earlier releases.
     fn from(error: toml::de::Error) -> Self {
-        let mut text = error.to_string();
+        let mut text = parse_problem(&error) + "\n";
         if ["`rings`", "`pays`"]
             .iter()
             .any(|key| error.message().contains(key))

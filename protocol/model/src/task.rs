@@ -3,7 +3,7 @@
 use crate::built_in::{TASKS, listed, state_names};
 use crate::grid::Cell;
 use crate::parameters::Model;
-use crate::text::read_text;
+use crate::text::{parse_problem, read_text, shortened};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::path::Path;
@@ -95,7 +95,7 @@ pub enum Start {
 
 /// The error for a task that cannot be loaded.
 #[derive(Debug, Error)]
-#[error("task {task}: {problem}")]
+#[error("task {}: {problem}", shortened(task))]
 pub struct TaskError {
     task: String,
     problem: String,
@@ -194,7 +194,7 @@ impl Task {
     }
 
     fn from_toml(text: &str) -> Result<Self, String> {
-        let task: Self = toml::from_str(text).map_err(|error| error.to_string())?;
+        let task: Self = toml::from_str(text).map_err(parse_problem)?;
         task.check()?;
         Ok(task)
     }
@@ -208,7 +208,7 @@ impl Task {
             return needs(
                 "name",
                 "1 to 64 letters, digits, '-', '_' and '.', not starting with '.'",
-                &format!("{:?}", self.name),
+                &format!("{:?}", shortened(&self.name)),
             );
         }
         if self.model.is_empty() != self.is_recorded() {

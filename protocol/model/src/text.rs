@@ -1,5 +1,7 @@
 //! Reads the text of settings and model files.
 
+use std::borrow::Cow;
+use std::fmt::Display;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -20,6 +22,41 @@ pub fn read_text(path: &Path) -> std::io::Result<String> {
         return Err(std::io::Error::other(problem));
     }
     decoded(&bytes).map_err(std::io::Error::other)
+}
+
+/// Maximum number of characters of a given value that an error quotes.
+const MAX_QUOTED: usize = 80;
+
+/// Returns a given value for an error: of a value with more than 80 characters, its beginning and its end.
+pub fn shortened(value: &str) -> Cow<'_, str> {
+    let n = value.chars().count();
+    if n <= MAX_QUOTED {
+        return value.into();
+    }
+    let half = MAX_QUOTED / 2;
+    let begin: String = value.chars().take(half - 1).collect();
+    let end: String = value.chars().skip(n - half).collect();
+    format!("{begin}…{end}").into()
+}
+
+/// Returns an error of a parser, which quotes lines and values of the text that it read, with each line and each word
+/// of at most 80 characters beyond its sentence.
+pub fn parse_problem(error: impl Display) -> String {
+    let text = error.to_string();
+    let words = |line: &str| line.split(' ').map(shortened).collect::<Vec<_>>().join(" ");
+    let cut = |line: &str| match line.split_once('|') {
+        // A line of the text, or the marks under it.
+        Some((number, rest))
+            if number.trim().parse::<u32>().is_ok() || number.trim().is_empty() =>
+        {
+            format!(
+                "{number}|{}",
+                rest.chars().take(MAX_QUOTED).collect::<String>().trim_end()
+            )
+        }
+        _ => words(line),
+    };
+    text.lines().map(cut).collect::<Vec<_>>().join("\n")
 }
 
 /// Decodes UTF-8 without the byte order mark, which editors on Windows write.
@@ -46,6 +83,33 @@ fn decoded(bytes: &[u8]) -> Result<String, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn long_values_are_quoted_by_their_ends() {
+        for (value, expected) in [
+            ("short".into(), "short".into()),
+            ("é".repeat(80), "é".repeat(80)),
+            (
+                "a".repeat(50) + &"é".repeat(50),
+                "a".repeat(39) + "…" + &"é".repeat(40),
+            ),
+        ] {
+            assert_eq!(shortened(&value), expected);
+            assert!(shortened(&value).chars().count() <= 80);
+        }
+        let (word, line) = ("x".repeat(500), "y ".repeat(500));
+        let problem =
+            format!("at line 3\n  |\n3 | {line}\n  | ^\nunknown field `{word}`, expected one\n");
+        let told = parse_problem(problem);
+        assert!(
+            told.ends_with(", expected one") || told.contains("x`, expected one"),
+            "{told}"
+        );
+        assert!(
+            told.lines().all(|line| line.chars().count() < 120),
+            "{told}"
+        );
+    }
 
     #[test]
     fn text_must_be_utf_8_and_errors_name_other_encodings() {

@@ -7,6 +7,7 @@ use anyhow::{Result, bail};
 use emberwatch_belief::planning::options;
 use emberwatch_model::Model;
 use emberwatch_model::built_in::listed;
+use emberwatch_model::text::shortened;
 
 /// Short names of policies, each with its parts: policies of the benchmark and the default learned policies.
 pub(super) const NAMED: &[(&str, &str)] = &[
@@ -173,6 +174,7 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
     };
     let one_of = |names: &str| format!("one of {names}");
     let wrong = |what: &str, expected: &str, got: &str| {
+        let (name, got) = (shortened(name), shortened(got));
         anyhow::anyhow!("policy {name:?}: {what}: expected {expected}, got {got:?}")
     };
     let words: Vec<&str> = parts.split('/').collect();
@@ -181,8 +183,9 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
         [belief, planner, goal] => (*belief, *planner, Some(*goal)),
         _ => bail!(
             "policy: expected one of {}, or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit (see `compare \
-             --policies help`), got {name:?}",
-            listed(NAMED.iter().map(|(name, _)| *name))
+             --policies help`), got {:?}",
+            listed(NAMED.iter().map(|(name, _)| *name)),
+            shortened(name)
         ),
     };
     let mut kinds = BELIEFS.iter().copied();

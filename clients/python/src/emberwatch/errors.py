@@ -45,8 +45,25 @@ class ExistingFileError(InvalidArgumentError, FileExistsError):
     """Raised if a file of results would replace an existing file."""
 
 
+def shortened(value: str) -> str:
+    """Returns at most 80 characters of a value for an error: of a longer one, both its ends."""
+    return value if len(value) <= 80 else f"{value[:39]}…{value[-40:]}"
+
+
+def repr_of(value: object) -> str:
+    """Returns the `repr` of an argument for an error: of a long one, both its ends.
+
+    If `repr` raises an exception, returns that.
+    """
+    try:
+        return shortened(repr(value))
+    except Exception as error:
+        return shortened(f"{type(value).__name__}: {error}")
+
+
 def invalid(subject: object, expected: object, got: object) -> InvalidArgumentError:
     """Returns the error for an invalid value: ``subject: expected ..., got ...``."""
+    got = got if isinstance(got, str | Exception) else shortened(str(got))
     return InvalidArgumentError(f"{subject}: expected {expected}, got {got}")
 
 

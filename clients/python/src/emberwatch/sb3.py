@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from emberwatch.envs.vector_base import WorldVectorEnv, info_of
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 
 
 def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
@@ -70,7 +70,7 @@ class WildfireVecEnv(VecEnv):
 
     def set_options(self, options: Any = None) -> None:
         if any([options] if options is None or isinstance(options, dict) else options):
-            raise invalid("set_options", "no options, as resets have none here", repr(options))
+            raise invalid("set_options", "no options, as resets have none here", repr_of(options))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self._actions = actions
@@ -106,7 +106,7 @@ class WildfireVecEnv(VecEnv):
         if method_name == "action_masks":
             return list(self.get_attr(method_name)[0]()[self._get_indices(indices)])
         expected = "'render' or 'action_masks', as all worlds share one environment"
-        raise invalid("env_method", expected, repr(method_name))
+        raise invalid("env_method", expected, repr_of(method_name))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from emberwatch.belief import Belief, known, load
 from emberwatch.belief.prior import PriorKind, prior_of
 from emberwatch.common.arguments import as_json
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
 from emberwatch.model import Model
 
 
@@ -93,7 +93,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         )
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):
-            raise invalid("dtype", "'float32' or 'uint8'", repr(dtype))
+            raise invalid("dtype", "'float32' or 'uint8'", repr_of(dtype))
         self._keep, self._dtype = keep, dtype
         original = _parts_of(env.observation_space, spaces.Dict)
         height, width = _grid_of(original)
@@ -182,12 +182,15 @@ def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) ->
     if model is not None:
         return Model.named(model)
     revealed = getattr(env.unwrapped, "model", None)
-    if not isinstance(revealed, Model):
-        raise InvalidArgumentError(
-            "BeliefObservation: the server does not reveal the model of its worlds "
-            "(--reveal-model false). Pass model=: a Model, its name or the path of its file"
-        )
-    return revealed
+    if isinstance(revealed, Model):
+        return revealed
+    why = "the environment does not reveal its model (a server: --reveal-model false)"
+    if getattr(getattr(env.unwrapped, "world_spec", None), "is_recorded", False):
+        why = "recorded worlds have no model"
+    raise InvalidArgumentError(
+        f"BeliefObservation: {why}. Pass model=: a Model, its name or the path of its file; or "
+        "checkpoint=, a belief that `emberwatch-agent train` learned"
+    )
 
 
 def _parts_of(whole: Any, kind: type[Any] = dict) -> dict[str, Any]:

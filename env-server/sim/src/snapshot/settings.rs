@@ -5,6 +5,7 @@ use crate::config::Checked;
 use crate::world::Rules;
 use bincode::{Decode, Encode};
 use emberwatch_model::ModelError;
+use emberwatch_model::text::shortened;
 use sha2::{Digest, Sha256};
 use std::fmt::Display;
 
@@ -124,10 +125,10 @@ impl Settings {
             let pairs = server.model.lines().zip(self.model.lines());
             let line = pairs.into_iter().find(|(expected, got)| expected != got);
             let n_lines = |text: &str| format!("{} lines", text.lines().count());
-            let start_of = |line| format!("{:?}", start_of(line));
+            let quoted = |line| format!("{:?}", shortened(line));
             let (expected, got) = line.map_or_else(
                 || (n_lines(&server.model), n_lines(&self.model)),
-                |(expected, got)| (start_of(expected), start_of(got)),
+                |(expected, got)| (quoted(expected), quoted(got)),
             );
             return Err(other("model", &expected, &got));
         }
@@ -145,9 +146,4 @@ impl Settings {
         }
         Ok(())
     }
-}
-
-/// Shortens a line of a model file for an error, because lines with a map can be long.
-fn start_of(line: &str) -> String {
-    line.chars().take(80).collect()
 }

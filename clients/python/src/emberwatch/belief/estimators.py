@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
 from emberwatch.belief.prior import distribution
-from emberwatch.common.arguments import as_array, as_count, as_flag, as_integer, repr_of
+from emberwatch.common.arguments import as_array, as_count, as_flag, as_integer
 from emberwatch.common.paths import utf8
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
 
 _Number = TypeVar("_Number", np.float32, np.float64)

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.common.arguments import as_array, as_count, repr_of
-from emberwatch.errors import invalid
+from emberwatch.common.arguments import as_array, as_count
+from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
 
 PriorKind = Literal["simulated", "initial", "uniform"]
@@ -93,5 +93,5 @@ def prior_of(
     simple = {"initial": initial_prior, "uniform": uniform_prior}
     if prior not in simple:
         expected = "'simulated', 'initial', 'uniform' or an array"
-        raise invalid("prior", expected, repr(prior))
+        raise invalid("prior", expected, repr_of(prior))
     return simple[prior](model, height=height, width=width)

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.belief.estimators import Belief, target_of
-from emberwatch.common.arguments import as_array, repr_of
+from emberwatch.common.arguments import as_array
 from emberwatch.common.codes import UNOBSERVED
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,11 +22,11 @@ from emberwatch.benchmark.rows import Row, RowFile
 from emberwatch.benchmark.tally import Tally
 from emberwatch.client import wire
 from emberwatch.client.client import Client
-from emberwatch.common.arguments import as_count, as_list, as_seed, repr_of
+from emberwatch.common.arguments import as_count, as_list, as_seed
 from emberwatch.common.paths import absolute
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
 from emberwatch.envs.settings import Settings, WorldArguments
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model.tasks import Task
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"

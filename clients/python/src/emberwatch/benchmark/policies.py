@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from emberwatch.common.arguments import as_array, repr_of
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.common.arguments import as_array
+from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 
 #: A function from stacked observations to actions, or a model of SB3.
 Policy: TypeAlias = Callable[..., Any]

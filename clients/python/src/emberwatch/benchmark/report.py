@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from emberwatch._native import FIRST_TRAINING_SEED
 from emberwatch.benchmark.rows import Row
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of
 
 
 class Progress:
@@ -51,7 +51,7 @@ def summary(rows: Sequence[Row], *, baseline: str | None = None) -> str:
     bases = [each for name, each in policies.items() if name[0] == baseline]
     if baseline is not None and len(bases) != 1:
         names = ", ".join(name for name, *_ in policies)
-        raise invalid("baseline", f"the name of one of the policies {names}", repr(baseline))
+        raise invalid("baseline", f"the name of one of the policies {names}", repr_of(baseline))
     lines = [
         _line(each) + "".join(_difference(each, base) for base in bases if each is not base)
         for each in policies.values()

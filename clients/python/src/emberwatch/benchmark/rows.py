@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from emberwatch.common.paths import utf8
-from emberwatch.errors import ExistingFileError, InvalidArgumentError, invalid
+from emberwatch.errors import ExistingFileError, InvalidArgumentError, invalid, repr_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +149,7 @@ class RowFile:
             expected = f"{self._path} to have the columns of evaluate"
             raise invalid("csv", expected, f"other ones: {others or 'another order'}")
         if self._policy in {row.policy for row in rows}:
-            raise invalid("name", f"one that is not in {self._path}", repr(self._policy))
+            raise invalid("name", f"one that is not in {self._path}", repr_of(self._policy))
         worlds = {(row.worlds_fingerprint, row.world_seed, row.steps) for row in rows}
         if rows and worlds != self._worlds:
             raise InvalidArgumentError(

@@ -11,9 +11,9 @@ from typing import Any, cast
 from emberwatch.benchmark.evaluation import evaluate
 from emberwatch.benchmark.policies import Policy
 from emberwatch.benchmark.rows import Row, check_writable
-from emberwatch.common.arguments import as_count, repr_of
+from emberwatch.common.arguments import as_count
 from emberwatch.common.paths import absolute
-from emberwatch.errors import ExistingFileError, invalid
+from emberwatch.errors import ExistingFileError, invalid, repr_of
 from emberwatch.model.tasks import Task, built_in_tasks
 
 

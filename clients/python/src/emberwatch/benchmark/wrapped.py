@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from emberwatch.common.arguments import repr_of
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.sb3 import WildfireVecEnv
 
 

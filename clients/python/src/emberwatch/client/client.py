@@ -29,7 +29,7 @@ from emberwatch.client.replies import (
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import read_settings
 from emberwatch.common.paths import utf8
-from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid
+from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid, repr_of
 from emberwatch.model import Model
 
 _Connection = TypeVar("_Connection")
@@ -108,7 +108,7 @@ class Client(ServerConnection):
                 is the nearest step that it keeps.
         """
         if not 0 <= step < 2**64:
-            raise invalid("step", "an integer within 0 to 2**64 - 1", repr(step))
+            raise invalid("step", "an integer within 0 to 2**64 - 1", repr_of(step))
         flags = wire.TEAM_FRAMES if team else 0
         body = step.to_bytes(8, sys.byteorder) * self.shape.n_worlds(first_robot, n_robots)
         return self.exchange(wire.RECALL, 0, first_robot, n_robots, flags, body, timeout=timeout)

@@ -9,7 +9,7 @@ from emberwatch._native import VERSION
 from emberwatch.client import wire
 from emberwatch.client.replies import ServerInfo, record
 from emberwatch.client.wire import StepAnswer
-from emberwatch.errors import bad_answer
+from emberwatch.errors import bad_answer, repr_of
 
 #: Default timeout of a step, seconds.
 STEP_TIMEOUT: Final = 5.0
@@ -120,5 +120,5 @@ def decoded(what: str, text: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise bad_answer(what, "JSON", error) from None
     if not isinstance(reply, dict):
-        raise bad_answer(what, "an object", repr(reply))
+        raise bad_answer(what, "an object", repr_of(reply))
     return cast("dict[str, Any]", reply)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.client.wire import Shape
-from emberwatch.common.arguments import repr_of
-from emberwatch.errors import bad_answer, invalid
+from emberwatch.errors import bad_answer, invalid, repr_of
 from emberwatch.model import Description, color_from_hex
 from emberwatch.model.airspace import Airspace, Zones
 
@@ -175,14 +174,14 @@ def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...
     """Parses the records of a reply's `worlds`."""
     worlds = reply.get("worlds")
     if not isinstance(worlds, list):
-        raise bad_answer("reply", "a list 'worlds'", repr(worlds))
+        raise bad_answer("reply", "a list 'worlds'", repr_of(worlds))
     return tuple(record(kind, world) for world in cast("list[Any]", worlds))
 
 
 def record(kind: type[_Record], keys: Any) -> _Record:
     """Parses a record of a reply. Keys that this release does not know are ignored."""
     if not isinstance(keys, Mapping):
-        raise bad_answer("reply", "an object", repr(keys))
+        raise bad_answer("reply", "an object", repr_of(keys))
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
@@ -198,7 +197,7 @@ def record(kind: type[_Record], keys: Any) -> _Record:
             raise bad_answer("reply", f"a key {name!r}", sorted(given))
         value = _as_tuples(given[name])
         if not isinstance(value, types):
-            raise bad_answer("reply", f"another {name!r}", repr(value))
+            raise bad_answer("reply", f"another {name!r}", repr_of(value))
         values[name] = value
     if kind is ServerInfo:
         values |= _land(given, (values["height"], values["width"]))

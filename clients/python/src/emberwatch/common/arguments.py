@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 import emberwatch._native as _native
 from emberwatch.common import codes
 from emberwatch.common.paths import utf8
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of, shortened
 
 _Value = TypeVar("_Value")
 
@@ -35,6 +35,8 @@ def as_setting(name: str, value: object) -> bool | int | str:
     if isinstance(value, np.generic):
         value = cast("object", value.item())
     if isinstance(value, bool | int):
+        if value.bit_length() > 8000:  # Python refuses to print it
+            raise invalid(name, "an integer below 2**64", repr_of(value))
         return value
     if name == "model" and isinstance(text := getattr(value, "toml", None), str):
         return text
@@ -95,7 +97,7 @@ def as_list(values: Iterable[_Value], subject: str) -> list[_Value]:
     try:
         return list(values)
     except Exception as error:  # of any type, as in `as_array`
-        got = f"{type(values).__name__}: {error}"
+        got = shortened(f"{type(values).__name__}: {error}")
         raise invalid(subject, "one for each world", got) from None
 
 
@@ -108,7 +110,8 @@ def as_array(value: object, subject: str, expected: str) -> NDArray[Any]:
     try:
         given = np.asarray(value)
     except Exception as error:  # of any type, for example for an array on a GPU
-        raise invalid(subject, expected, f"{type(value).__name__}: {error}") from None
+        got = shortened(f"{type(value).__name__}: {error}")
+        raise invalid(subject, expected, got) from None
     is_sequence = isinstance(value, list | tuple)
     if any(map(_is_masked, cast("list[object]", value))) if is_sequence else _is_masked(value):
         raise invalid(subject, expected, "masked values")
@@ -117,14 +120,6 @@ def as_array(value: object, subject: str, expected: str) -> NDArray[Any]:
 
 def _is_masked(value: object) -> bool:
     return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(cast("Any", value)))
-
-
-def repr_of(value: object) -> str:
-    """Returns the `repr` of an argument for an error, or the exception that its `repr` raises."""
-    try:
-        return repr(value)
-    except Exception as error:
-        return f"{type(value).__name__}: {error}"
 
 
 def as_json(value: object) -> Any:

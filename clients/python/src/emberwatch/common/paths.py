@@ -5,7 +5,7 @@ import sys
 from typing import Any, Final, cast
 
 import emberwatch._native as _native
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of, shortened
 
 #: Character that editors on Windows write at the beginning of UTF-8 text.
 BYTE_ORDER_MARK: Final = "\ufeff"
@@ -16,12 +16,12 @@ def utf8(subject: str, path: str | os.PathLike[str]) -> str:
     try:
         text = os.fsencode(path).decode()
     except TypeError:
-        raise invalid(subject, "text or a path", repr(path)) from None
+        raise invalid(subject, "text or a path", repr_of(path)) from None
     except UnicodeError:
         text = "\0"
     if "\0" in text:
         expected = "UTF-8, and a locale that has its letters, such as LC_ALL=C.UTF-8"
-        raise invalid(subject, expected, ascii(os.fspath(path)))
+        raise invalid(subject, expected, shortened(ascii(os.fspath(path))))
     return text
 
 

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.client.wire import UNOBSERVED, StepAnswer
-from emberwatch.common.arguments import as_seed, repr_of
+from emberwatch.common.arguments import as_seed
 from emberwatch.envs.observations import Observations
 from emberwatch.envs.owner import SessionOwner
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import draw_seed
 from emberwatch.envs.view import RENDER_FPS, RENDER_MODES, View
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model.moves import fly
 
 NOTHING_TO_DRAW: Final = (
@@ -125,7 +125,7 @@ def check_reward(reward: str, *more: str) -> int:
     """Returns the index of a reward in `REWARDS`, or for a reward in `more`, of `"share"`."""
     if reward not in (*REWARDS, *more):
         expected = ", ".join(map(repr, (*REWARDS, *more)))
-        raise invalid("reward", f"one of {expected}", repr(reward))
+        raise invalid("reward", f"one of {expected}", repr_of(reward))
     return REWARDS.index(reward) if reward in REWARDS else 0
 
 

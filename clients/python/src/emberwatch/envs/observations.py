@@ -15,7 +15,7 @@ from emberwatch.common.arguments import as_integer
 from emberwatch.envs.last_seen import LastSeen
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.envs.window import N_OF_BELIEF, N_OF_PATH, of_belief
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 
 Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
 MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move", "action_mask"]
@@ -57,7 +57,7 @@ class Observations:
         known = _spaces(spec, None if flights is None else window)
         names = names_of(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
-            raise invalid("observation", f"one or several of {', '.join(known)}", repr(parts))
+            raise invalid("observation", f"one or several of {', '.join(known)}", repr_of(parts))
         self._names, self._is_plain = names, isinstance(parts, str)
         self._spec, self._n_rows, self._flights = spec, n_rows, flights
         self._first = first
@@ -253,7 +253,7 @@ def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]
     if window is None:
         return known
     if as_integer(window) is None or not 3 <= window <= MAX_WINDOW or not window & 1:
-        raise invalid("window", f"an odd number, 3 to {MAX_WINDOW}", repr(window))
+        raise invalid("window", f"an odd number, 3 to {MAX_WINDOW}", repr_of(window))
 
     def around(n_of_world: int) -> spaces.Box:
         return spaces.Box(0, 255, (window, window, n_of_world + N_OF_PATH), np.uint8)

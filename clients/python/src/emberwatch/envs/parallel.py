@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from emberwatch.client.wire import UNOBSERVED
-from emberwatch.common.arguments import as_array, repr_of
+from emberwatch.common.arguments import as_array
 from emberwatch.envs.base import NOTHING_TO_DRAW, as_options
 from emberwatch.envs.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.envs.observations import MovesParts, names_of, of_row
@@ -23,7 +23,7 @@ from emberwatch.envs.path_env import WildfireVectorEnv
 from emberwatch.envs.settings import WorldArguments, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv, info_of
 from emberwatch.envs.view import RENDER_FPS, RENDER_MODES
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of
 
 _ENVIRONMENTS: Final = {"move": WildfireMovesVectorEnv, "path": WildfireVectorEnv}
 _OBSERVATIONS: Final = {"move": "local", "path": ("frame", "robot")}
@@ -63,7 +63,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     ) -> None:
         """See the class. Worlds are created or acquired at the first reset."""
         if action not in _ENVIRONMENTS:
-            raise invalid("action", "'move' or 'path'", repr(action))
+            raise invalid("action", "'move' or 'path'", repr_of(action))
         if world.get("instance") is None and world.get("task") is None:
             world.setdefault("robots", 2)
         keywords: dict[str, Any] = {"reward": reward, **world}

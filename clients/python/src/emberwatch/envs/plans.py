@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 import emberwatch._native as _native
 from emberwatch.client.wire import RobotResult, StepResult, WorldResult
-from emberwatch.common.arguments import repr_of
 from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
 
 Estimator: TypeAlias = Literal[
     "known",

@@ -19,7 +19,7 @@ from emberwatch.client.replies import ServerInfo
 from emberwatch.client.wire import Shape
 from emberwatch.common.arguments import read_settings
 from emberwatch.common.paths import utf8
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace, Zones
 from emberwatch.model.tasks import Task, built_in_tasks
@@ -105,7 +105,7 @@ class Settings:
                 object.__setattr__(self, each.name, value)
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
-                raise invalid(each.name, each.type, repr(value))
+                raise invalid(each.name, each.type, repr_of(value))
         for name in ("task", "model", "states", "start"):
             value = getattr(self, name)
             if isinstance(value, str | Path):
@@ -339,7 +339,7 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     task = Task.of(read)
     assert task is not None
     if task.name != info.task:
-        raise invalid("task", f"the server's {info.task!r}, or None", repr(task.name))
+        raise invalid("task", f"the server's {info.task!r}, or None", repr_of(task.name))
     own: dict[str, Any] = json.loads(read.settings)
     has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
     has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from emberwatch._native import columns
 from emberwatch.client.wire import RESULT_DTYPE, StepAnswer
-from emberwatch.common.arguments import as_array, as_integer, as_seed, repr_of
+from emberwatch.common.arguments import as_array, as_integer, as_seed
 from emberwatch.envs.base import (
     NOTHING_TO_DRAW,
     WorldEnv,
@@ -30,7 +30,7 @@ from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, draw_seed
 from emberwatch.envs.view import View
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of
 from emberwatch.model.moves import fly
 
 
@@ -385,7 +385,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         shape = (self.num_envs,)
         if mask is None:
             return np.ones(shape, np.bool_)
-        got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
+        got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr_of(mask.__class__)
         if got != f"bool {shape}" or np.ma.is_masked(mask) or not mask.any():
             expected = f"an array {shape} of bool with at least one True, none masked"
             raise invalid("reset_mask", expected, got)

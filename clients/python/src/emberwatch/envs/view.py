@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.envs.settings import WorldSpec
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 from emberwatch.render.scenery import Scenery
 
@@ -24,7 +24,7 @@ class View:
     def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise invalid(
-                "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr(render_mode)
+                "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr_of(render_mode)
             )
         self.mode: Final = render_mode
         self._scenery: Final = Scenery.of(spec.airspace, spec.zones)

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch._native import MAX_RADIUS
-from emberwatch.common.arguments import as_count, repr_of
-from emberwatch.errors import invalid
+from emberwatch.common.arguments import as_count
+from emberwatch.errors import invalid, repr_of
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
