@@ -171,14 +171,16 @@ def test_resume_continues_another_agents_episode() -> None:
         command += ["--steps", "5", "--policy", "random_walk"]
         subprocess.run(command, check=True, capture_output=True, timeout=30)
         with emberwatch.connect(instance) as client:
-            left = client.observe()
+            left, earlier = client.observe(), [client.recall(step) for step in range(5)]
         env = make(instance=instance, observation=PARTS, max_episode_steps=3)
         observation, info = env.reset(options={"resume": True})
         assert info["step"] == 5
         assert observation["frame"].tobytes() == left.frames.tobytes()
         assert tuple(observation["robot"]) == left.result().robot.cell
-        seen = observation["frame"] != 255
-        assert (observation["age"] == np.where(seen, 0, 255)).all()
+        ages = np.full(observation["age"].shape, 255)
+        for age, answer in enumerate(reversed((*earlier, left))):
+            ages[(answer.frames[0, ..., None] != 255) & (ages == 255)] = age
+        assert (observation["age"] == ages).all()
         # The time limit counts only the environment's own steps.
         steps = [env.step(action) for action in actions(env, 3)]
         assert [step[4]["step"] for step in steps] == [6, 7, 8]

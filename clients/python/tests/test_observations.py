@@ -1,11 +1,24 @@
 """Parts of observations: their contents, and agreement of single and vector environments."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES, WILDFIRE, actions, make, serving
+from environments import (
+    LIVELY,
+    MOVES,
+    WILDFIRE,
+    actions,
+    assert_same,
+    make,
+    make_vec,
+    no_warnings,
+    rollout,
+    serving,
+)
 from failures import refuses
 
 from emberwatch.belief import Transition, entropy
@@ -94,18 +107,68 @@ def test_a_window_shows_the_last_observations_nearby() -> None:
                     expected[seen["frame"] == np.arange(3)] = 1
 
 
-def test_a_resumed_belief_uses_only_the_last_frame() -> None:
-    with serving(model=LIVELY) as instance:
-        first = make(instance=instance, observation=("frame", "belief"))
-        first.reset(seed=4)
-        last = first.step(actions(first, 1)[0])[0]
+#: Parts that remember frames, and parts about a path.
+OF_PATHS = ("frame", "age", "belief")
+OF_MOVES = (*OF_PATHS, "local", "recent", "visited", "move")
+
+#: Environments: how to make one, its observation and its number of steps before it is left.
+JOINED: dict[str, tuple[Callable[..., Any], tuple[str, ...], int]] = {
+    "path": (make, OF_PATHS, 9),
+    "moves": (partial(make, MOVES), OF_MOVES, 12),
+    "paths": (partial(make_vec, 3), OF_PATHS, 9),
+    "many moves": (partial(make_vec, 3, MOVES), OF_MOVES, 12),
+}
+
+
+@pytest.mark.parametrize("of", JOINED)
+def test_a_joined_episode_continues_from_the_recalled_frames(of: str) -> None:
+    maker, parts, n_steps = JOINED[of]
+    with serving(model=LIVELY, worlds=3) as instance:
+        first = maker(instance=instance, observation=parts)
+        last = rollout(first, n_steps, seed=4)[-1][0]
         first.close()
-        second = make(instance=instance, observation=("frame", "belief"))
-        seen, _ = second.reset(options={"resume": True})
-        # The prior, corrected with only the last frame: earlier frames are lost.
-        assert np.array_equal(seen["frame"], last["frame"])
-        unseen, _ = second.reset(seed=4)
-        assert not np.array_equal(seen["belief"], unseen["belief"])
+        second = maker(instance=instance, observation=parts)
+        joined, _ = second.reset(options={"resume": True})
+        assert_same(joined, last)
+
+
+@pytest.mark.parametrize("of", JOINED)
+def test_a_resumed_environment_continues_its_own_path_and_memory(of: str) -> None:
+    maker, parts, n_steps = JOINED[of]
+    whole, halved = (maker(observation=parts) for _ in range(2))
+    chosen = actions(whole, n_steps + 9)
+    for env in (whole, halved):
+        env.reset(seed=4)
+    before: Any = None
+    for step, action in enumerate(chosen):
+        expected = whole.step(action)
+        if step in (n_steps // 2 - 1, n_steps):
+            assert_same(halved.reset(options={"resume": True})[0], before)
+        assert_same(halved.step(action), expected)
+        before = expected[0]
+
+
+def test_a_robot_joins_its_team_with_its_earlier_frames() -> None:
+    with serving(model=LIVELY, robots=2) as instance:
+        first = make(instance=instance, robot=1, observation=OF_PATHS)
+        last = rollout(first, 9, seed=None)[-1][0]
+        first.close()
+        second = make(instance=instance, robot=1, observation=OF_PATHS)
+        assert_same(second.reset()[0], last)
+
+
+def test_a_gap_before_the_kept_frames_is_told_once() -> None:
+    with serving(model=LIVELY, history=3) as instance:
+        first = make(instance=instance)
+        rollout(first, 9, seed=4)
+        first.close()
+        second = make(instance=instance, observation=OF_PATHS)
+        with pytest.warns(UserWarning, match="joins an episode whose first . steps are no longer"):
+            joined, _ = second.reset(options={"resume": True})
+        ages = np.unique(joined["age"]).tolist()
+        assert ages[-1] == 255 and max(ages[:-1]) <= 3
+        with no_warnings():
+            BeliefObservation(second).reset(options={"resume": True})
 
 
 def test_fires_persist_in_small_worlds() -> None:

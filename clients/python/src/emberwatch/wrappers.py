@@ -4,7 +4,7 @@ A frame shows only the cells of one path. A belief sums up all frames so far, so
 without memory can act on it.
 """
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
@@ -33,8 +33,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     Emberwatch's environments report the world's step k in ``info["step"]``, and the belief follows
     it. After a step that makes only one move of a path, the belief stays as it is. After a step
     that flies several paths, the belief is predicted once per path and corrected with the last
-    frame. In environments that do not report k, each step of the environment counts as one step of
-    the world.
+    frame. A reset that resumes or joins an episode (`resume`, `robot`) continues from the frames
+    that the server keeps of it, and warns if some are missing. In environments that do not report
+    k, each step of the environment counts as one step of the world.
 
     ## Observations
     After `reset`, the observation is the prior about ``X_0``, the world after its burn-in. A step
@@ -110,7 +111,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             found = None if is_hidden else _model_of(env, model)
             self._belief = load(checkpoint, **grid, kind=kind, model=found)
         #: Whether an episode has begun and no step since then was interrupted.
-        self._is_begun = False
+        self._is_begun = self._was_begun = False
+        self._frame = np.empty(0, np.uint8)
         self._step = 0
         self.observation_space = self._space(original, height, width)
 
@@ -132,10 +134,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     ) -> tuple[Any, dict[str, Any]]:
         with self._between():
             observation, info = self.env.reset(seed=seed, options=options)
-        self._step = int(info.get("step", 0))
-        self._belief.reset()
-        self._belief.correct(_frame_of(observation))  # empty, unless an episode was resumed
-        self._is_begun = True
+        self._begin(int(info.get("step", 0)), _frame_of(observation))
         return self._observe(observation), info
 
     def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -147,17 +146,40 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             belief.predict()
         if self._step > before:
             belief.correct(_frame_of(observation))
-        self._is_begun = True
+        self._is_begun, self._frame = True, _frame_of(observation).copy()
         return self._observe(observation), reward, terminated, truncated, info
+
+    def _begin(self, step: int, frame: NDArray[np.uint8]) -> None:
+        """Begins an episode, or joins one at a later step."""
+        is_next = self._was_begun and step == self._step and np.array_equal(frame, self._frame)
+        if step == 0 or not is_next:  # otherwise the episode continues where this wrapper left it
+            self._belief.reset()
+            for past in self._past_frames(step):
+                self._belief.correct(past)
+                self._belief.predict()
+            self._belief.correct(frame)
+        self._step, self._frame, self._is_begun = step, frame.copy(), True
+
+    def _past_frames(self, step: int) -> Iterable[NDArray[np.uint8]]:
+        if step == 0:
+            return ()
+        past = getattr(self.env.unwrapped, "past_frames", None)
+        if past is not None:
+            return past()
+        gymnasium.logger.warn(
+            f"BeliefObservation: the episode is joined at step {step}, and the environment has no "
+            "method `past_frames`: the belief begins anew"
+        )
+        return ()
 
     @contextmanager
     def _between(self) -> Generator[None]:
         """Marks the belief as outdated during a call, and as valid again if the call is refused."""
-        was_begun, self._is_begun = self._is_begun, False
+        self._was_begun, self._is_begun = self._is_begun, False
         try:
             yield
         except (EmberwatchError, gymnasium.error.Error):
-            self._is_begun = was_begun
+            self._is_begun = self._was_begun
             raise
 
     def _observe(self, observation: Any) -> Any:

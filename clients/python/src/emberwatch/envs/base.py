@@ -1,6 +1,6 @@
 """The base class of the environments of one robot, and checks that several environments share."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Final, Literal, TypeAlias, cast
 
 import gymnasium
@@ -11,7 +11,7 @@ from emberwatch.client.wire import UNOBSERVED, StepAnswer
 from emberwatch.common.arguments import as_seed
 from emberwatch.envs.observations import Observations
 from emberwatch.envs.owner import SessionOwner
-from emberwatch.envs.session import Session
+from emberwatch.envs.session import Session, not_reset
 from emberwatch.envs.settings import draw_seed
 from emberwatch.envs.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
@@ -62,8 +62,22 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._view.close()
         self._answer = None  # an answer cannot be copied or pickled
 
-    def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
-        """Begins an episode, or continues the world's current one."""
+    def past_frames(self) -> Iterator[NDArray[np.uint8]]:
+        """Yields the robot's frames before the current step, `(H, W)`, from the first that is kept.
+
+        Warns once if frames from the beginning of the episode are no longer kept.
+        """
+        if self._answer is None:
+            raise not_reset()
+        step = int(self._answer.worlds["step"][0])
+        return (past.frames[0] for past in self._session.history(0, step))
+
+    def _begin(self, seed: int | None, options: dict[str, Any] | None) -> tuple[StepAnswer, bool]:
+        """Begins an episode, or continues the world's current one.
+
+        Returns the answer, and whether it is the one that the environment has already processed.
+        """
+        processed = None if self._session.is_unfinished else self._answer
         resumes = wants_to_resume(options, seed) or self._robot is not None
         seed = None if seed is None else as_seed(seed)
         super().reset(seed=seed)
@@ -75,8 +89,11 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         else:
             drawn = draw_seed(self.np_random) if seed is None else seed
             answer = self._session.reset([0], [drawn])
-        self._path, self._n_missed = None, 0
-        return answer
+        told = None if processed is None else processed.results.tobytes()
+        continues = answer.results.tobytes() == told
+        if not continues:
+            self._path, self._n_missed = None, 0
+        return answer, continues
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
         """Updates the observations with one empty frame per missed step, then with `answer`."""

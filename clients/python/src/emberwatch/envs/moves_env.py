@@ -83,12 +83,14 @@ class WildfireMovesEnv(WorldEnv):
     ## Episode End
 
     Never `terminated`. `truncated` after `max_episode_steps` moves (default 64,000, which is 1,000
-    paths of 64 moves; pass another number to `gymnasium.make`), or after the running server's
-    `--max-steps`.
+    paths of 64 moves; pass another number to `gymnasium.make`), or after the number of paths set
+    by the task or by the running server's `--max-steps`.
 
     ## Starting State, Information
 
-    As in `WildfireEnv`. Except for `action_mask`, the info is about the last complete path.
+    As in `WildfireEnv`. If an episode ends within a path, `reset(options={"resume": True})` of the
+    same environment continues this path, unless the world has moved. The moves of a path exist
+    only in the environment that makes them: another environment begins a new path. Except for `action_mask`, the info is about the last complete path.
 
     ## Arguments
 
@@ -121,9 +123,7 @@ class WildfireMovesEnv(WorldEnv):
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
         super().__init__(Session(settings))
         self._flights = flights = flights_of(self._spec, 1, pays=reward == "move")
-        self._observations = Observations(
-            observation, self._spec, 1, flights, window, first=self._robot or 0
-        )
+        self._observations = Observations(observation, self._session, flights, window)
         self._seen_teams: StepAnswer | None = None
         self.observation_space = self._observations.space
         self.action_space = spaces.Discrete(wire.N_MOVES)
@@ -136,9 +136,10 @@ class WildfireMovesEnv(WorldEnv):
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
         with self._session.turn:
-            answer = self._begin(seed, options)
-            self._observations.reset(ONE_ROW, answer.frames)
-            self._begin_path(answer)
+            answer, continues = self._begin(seed, options)
+            if not continues:
+                self._observations.begin(ONE_ROW, answer.results, answer.frames)
+                self._begin_path(answer)
             seen = self._seen(answer)
             self._session.finish()
         return seen
@@ -243,7 +244,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         session = vector_session(settings, num_envs)
         n_rows = session.n_rows
         self._flights = flights = flights_of(session.spec, n_rows, pays=reward == "move")
-        self._parts = Observations(observation, session.spec, n_rows, flights, window)
+        self._parts = Observations(observation, session, flights, window)
         super().__init__(
             session,
             self._parts,

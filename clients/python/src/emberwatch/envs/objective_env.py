@@ -106,8 +106,9 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begins an episode; see `WildfireEnv`."""
         with self._session.turn:
-            answer = self._begin(seed, options)
-            self._plans.begin(ONE_ROW, answer.results, answer.frames)
+            answer, continues = self._begin(seed, options)
+            if not continues:
+                self._plans.begin(ONE_ROW, answer.results, answer.frames)
             seen = self._seen(answer)
             self._session.finish()
         return seen
@@ -188,6 +189,3 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
         self._exchange(self._plans.paths(actions), flown)
         self._plans.see(flown, actions, self._results, self._frames)
         return self._columns.rewards.copy()
-
-    def _begin(self, begun: NDArray[np.bool_]) -> None:
-        self._plans.begin(begun, self._results, self._frames)

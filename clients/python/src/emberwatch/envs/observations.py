@@ -13,6 +13,7 @@ from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
 from emberwatch.common.arguments import as_integer
 from emberwatch.envs.last_seen import LastSeen
+from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.envs.window import N_OF_BELIEF, N_OF_PATH, of_belief
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
@@ -42,25 +43,24 @@ class Observations:
     def __init__(
         self,
         parts: str | Sequence[str],
-        spec: WorldSpec,
-        n_rows: int = 1,
+        session: Session,
         flights: Flights | None = None,
         window: int = WINDOW,
-        *,
-        first: int = 0,
     ) -> None:
         """Checks the parts and makes their spaces.
 
-        With `flights`, the parts about an incomplete path are available. `first` is the index of
-        the first row's robot in its world.
+        With `flights`, the parts about an incomplete path are available.
         """
+        spec, n_rows = session.spec, session.n_rows
         known = _spaces(spec, None if flights is None else window)
         names = names_of(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
             raise invalid("observation", f"one or several of {', '.join(known)}", repr_of(parts))
         self._names, self._is_plain = names, isinstance(parts, str)
-        self._spec, self._n_rows, self._flights = spec, n_rows, flights
-        self._first = first
+        self._session, self._spec = session, spec
+        self._n_rows, self._flights = n_rows, flights
+        #: The index of the first row's robot in its world.
+        self._first = session.settings.robot or 0
         #: Whether a part is about other robots.
         self.shows_team = bool(OF_TEAM & set(names))
         if OF_BELIEF & set(names) and spec.model is None:
@@ -89,11 +89,29 @@ class Observations:
         # One row for each observed value, and a last row for unobserved cells.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
 
-    def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Resets the rows `begun`, whose episodes have just begun or have been resumed.
+    def begin(
+        self, begun: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
+    ) -> None:
+        """Begins the episodes of the rows `begun`, or joins them at their current step.
 
-        `frames` has a frame for every row, shape (n_rows, H, W).
+        The frames that the worlds still keep of a joined episode come first. `results` and `frames`
+        have an entry for every row.
         """
+        steps = results["world"]["step"]
+        joined = begun & (steps > 0) & (not self._has_no_memory)
+        self._reset(begun & ~joined, frames)
+        for row in np.flatnonzero(joined).tolist():
+            show, one, seen = self._reset, np.arange(self._n_rows) == row, np.zeros_like(frames)
+            for past in self._session.history(row, int(steps[row])):
+                seen[row] = past.frames[0]
+                show(one, seen)
+                show = self.update
+            show(one, frames)
+
+    def _reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """Forgets everything in the rows `begun`, then shows their frames, (n_rows, H, W)."""
+        if not begun.any():
+            return
         if self._last_seen is not None:
             self._last_seen.reset(begun, frames)
         if OF_BELIEF & set(self._names):

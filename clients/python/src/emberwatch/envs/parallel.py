@@ -26,6 +26,9 @@ from emberwatch.envs.view import RENDER_FPS, RENDER_MODES
 from emberwatch.errors import invalid, repr_of
 
 _ENVIRONMENTS: Final = {"move": WildfireMovesVectorEnv, "path": WildfireVectorEnv}
+#: Default length of episodes without a task, in paths.
+_N_PATHS: Final = 1000
+
 _OBSERVATIONS: Final = {"move": "local", "path": ("frame", "robot")}
 
 
@@ -46,8 +49,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     * `observation`: observation parts, by default `"local"` for moves and `("frame", "robot")` for
       paths.
     * `reward`: `"share"` (the default), `"team"`, `"marginal"`, or with moves also `"move"`.
-    * `max_episode_steps`: number of moves or paths after which episodes are truncated (1,000).
-      None: never.
+    * `max_episode_steps`: number of moves or paths after which episodes are truncated; None: never.
+      By default, `"task"`, after the paths of the task, or after 1,000 paths without a task.
     """
 
     @shows_keywords
@@ -57,7 +60,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         action: Literal["move", "path"] = "move",
         observation: MovesParts | None = None,
         reward: MovesReward = "share",
-        max_episode_steps: int | None = 1000,
+        max_episode_steps: int | Literal["task"] | None = "task",
         window: int | None = None,
         **world: Unpack[WorldArguments],
     ) -> None:
@@ -72,7 +75,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             keywords["window"] = window
         self._worlds: Final[WorldVectorEnv] = _ENVIRONMENTS[action](
             num_envs=None,
-            max_episode_steps=max_episode_steps,
+            max_episode_steps=None if max_episode_steps == "task" else max_episode_steps,
             autoreset_mode=AutoresetMode.DISABLED,
             **keywords,
         )
@@ -97,6 +100,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         for space in (*self.observation_spaces.values(), *self.action_spaces.values()):
             space.seed()
         spec = self._worlds.world_spec
+        if max_episode_steps == "task":
+            n_paths = _N_PATHS if spec.task is None else spec.task.max_steps
+            self._worlds.end_after(n_paths * (spec.n_moves if action == "move" else 1))
         #: The space of `state`.
         self.state_space = spaces.Box(
             0, 255, (spec.height, spec.width, spec.n_observations + 2), np.uint8

@@ -87,7 +87,8 @@ class WildfireEnv(WorldEnv):
     function of the seed: `reset(seed=s)` begins the same episode here, in the vector environment
     and in Rust. A reset without a seed draws one from `np_random`. The robot is at `start`, and no
     cell has been observed. `reset(options={"resume": True})` begins no episode. It continues the
-    current episode, for example after another agent, or after an interrupted step.
+    current episode, for example after another agent, or after an interrupted step. Parts with a
+    memory (`belief`, `age`) then continue from the frames that the server keeps (`--history`).
 
     ## Episode End
 
@@ -154,7 +155,7 @@ class WildfireEnv(WorldEnv):
         settings = Settings.of(WildfireEnv, world)
         self._pays = check_reward(reward)
         super().__init__(Session(settings))
-        self._observations = Observations(observation, self._spec, first=self._robot or 0)
+        self._observations = Observations(observation, self._session)
         self.observation_space = self._observations.space
         self.action_space = spaces.MultiDiscrete([wire.N_MOVES] * self._spec.n_moves)
 
@@ -166,8 +167,10 @@ class WildfireEnv(WorldEnv):
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
         with self._session.turn:
-            self._answer = answer = self._begin(seed, options)
-            self._observations.reset(ONE_ROW, answer.frames)
+            answer, continues = self._begin(seed, options)
+            self._answer = answer
+            if not continues:
+                self._observations.begin(ONE_ROW, answer.results, answer.frames)
             _, _, _, step, n_visited, cells = answer.native.numbers(self._pays)
             seen = self._seen(answer, step, n_visited, cells)
             self._session.finish()
@@ -249,7 +252,7 @@ class WildfireVectorEnv(WorldVectorEnv):
         session = vector_session(settings, num_envs)
         super().__init__(
             session,
-            Observations(observation, session.spec, session.n_rows),
+            Observations(observation, session),
             spaces.MultiDiscrete([wire.N_MOVES] * session.spec.n_moves),
             pays=pays,
             max_episode_steps=max_episode_steps,

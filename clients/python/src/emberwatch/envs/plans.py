@@ -122,9 +122,6 @@ class Plans:
         """
         self._plan(moved, results, frames, choices)
 
-    def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Does nothing: `begin` does the work, as it also needs the results."""
-
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
         """Does nothing: `see` does the work, as it also needs the results."""
 

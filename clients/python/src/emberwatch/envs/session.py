@@ -25,6 +25,7 @@ from emberwatch.client.replies import LeftBelief
 from emberwatch.client.wire import StepAnswer, WorldResult
 from emberwatch.envs.advice import (
     about_barren_worlds,
+    about_forgotten_steps,
     warn,
     warn_of_test_worlds,
     warn_without_rewards,
@@ -93,6 +94,7 @@ class Session:
         self._own: CheckedSettings | None = None
         self._truth: Newest[Truth] | Present | None = None
         self._has_warned = False
+        self._has_warned_of_gap = False
         self._state = State.CLOSED
         self._turn = ForkLock()
         #: Whether test worlds are allowed without a warning, as in an evaluation.
@@ -239,7 +241,10 @@ class Session:
             raise self._lost(error) from None
 
     def history(self, row: int, step: int) -> Iterator[StepAnswer]:
-        """Yields the earlier steps of a robot's episode, from the first one that is still kept."""
+        """Yields the earlier steps of a robot's episode, from the first one that is still kept.
+
+        Warns once if that is not the episode's first step.
+        """
         client, robot, past = self._client, self._robots[row], 0
         while client is not None and past < step:
             try:
@@ -252,6 +257,9 @@ class Session:
                 if past > 0:
                     return
                 past = error.detail - 1
+                if not self._has_warned_of_gap:
+                    self._has_warned_of_gap = True
+                    warn(about_forgotten_steps(row, error.detail))
             past += 1
 
     def close(self) -> None:

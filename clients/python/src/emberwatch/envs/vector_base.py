@@ -134,11 +134,15 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
                     "got some"
                 )
             self.closed = False
+            was_ready = self.is_open and not self._session.is_unfinished
             self._session.begin_reset()
             chosen = np.flatnonzero(mask).tolist()
             if resumes:
+                processed = self._results.view(np.uint8).reshape(self.num_envs, -1)
                 self._take(self._session.resume())
-                self._reset_episodes(chosen)
+                told = self._results.view(np.uint8).reshape(self.num_envs, -1)
+                moved = (processed != told).any(axis=1) if was_ready else self._every
+                self._reset_episodes(chosen, moved)
             else:
                 self._restart(chosen, seeds)
             outcome = self._seen(), self._infos(mask)
@@ -212,6 +216,10 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         """
         return self._truths
 
+    def end_after(self, max_episode_steps: int | None) -> None:
+        """Replaces the number of steps after which episodes are truncated; None: never."""
+        self._max_steps = max_episode_steps
+
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()
         for view in self._views:
@@ -270,18 +278,23 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
                 self._generators[world] = generator
             chosen.append(draw_seed(generator) if seed is None else seed)
         self._take(self._session.reset(worlds, chosen))
-        self._reset_episodes(rows)
+        self._reset_episodes(rows, self._every)
 
-    def _reset_episodes(self, rows: list[int]) -> None:
+    def _reset_episodes(self, rows: list[int], moved: NDArray[np.bool_]) -> None:
+        """Begins or resumes the episodes of some rows.
+
+        In rows that have not `moved` since the last step, the robots' paths and memory continue.
+        """
         self._elapsed[rows] = 0
         self._over = self._over.copy()
         self._over[rows] = False
         self._has_ended = bool(self._over.any())
         begun = np.zeros(self.num_envs, np.bool_)
         begun[rows] = True
-        self._observations.reset(begun, self._frames)
+        begun &= moved
+        self._observations.begin(begun, self._results, self._frames)
         self._begin(begun)
-        for row in rows:
+        for row in np.flatnonzero(begun).tolist():
             self._paths[row] = None
 
     def _take(self, answer: StepAnswer) -> None:
