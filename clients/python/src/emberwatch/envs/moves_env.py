@@ -90,7 +90,8 @@ class WildfireMovesEnv(WorldEnv):
 
     As in `WildfireEnv`. If an episode ends within a path, `reset(options={"resume": True})` of the
     same environment continues this path, unless the world has moved. The moves of a path exist
-    only in the environment that makes them: another environment begins a new path. Except for `action_mask`, the info is about the last complete path.
+    only in the environment that makes them: another environment begins a new path. Except for
+    `action_mask`, the info is about the last complete path.
 
     ## Arguments
 
