@@ -5,6 +5,7 @@ use crate::belief::first_belief;
 use crate::connection::checked;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
+use crate::origin::read;
 use crate::owned::Owned;
 use crate::planned_worlds::{Observed, PlannedWorlds, Watched};
 use crate::refusal::{invalid, refused};
@@ -14,10 +15,8 @@ use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::feature_names;
 use emberwatch_learning::beliefs::{self, BeliefKind};
 use emberwatch_learning::config::{AgentConfig, PriorKind};
-use emberwatch_learning::learners;
 use emberwatch_learning::options::{Crew, usual};
 use emberwatch_model::{Description, Model};
-use emberwatch_network::Device;
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
 use std::path::PathBuf;
@@ -95,8 +94,7 @@ impl Options {
             let got = format!("'{prior}'");
             invalid(py, "prior", "'simulated', 'initial' or 'uniform'", got)
         })?;
-        let learned = py.detach(|| learners::read(checkpoint.as_deref(), &Device::Cpu));
-        let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
+        let learned = read(py, checkpoint.as_deref())?;
         let shape = shape_of(py, spec.height, spec.width)?;
         let kind_of_belief = estimator.unwrap_or_else(|| usual(&learned));
         let model = model(py, &spec, kind_of_belief)?;
