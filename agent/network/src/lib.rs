@@ -39,7 +39,7 @@ mod window;
 
 pub use adam::{Adam, AdamSettings};
 pub use autoencoder::{Autoencoder, AutoencoderSettings};
-pub use candle_core::Device;
+pub use candle_core::{Device, utils::barrier_pool};
 pub use decoder::Decoder;
 pub use device::{DeviceError, DeviceKind};
 pub use dqn::{Dqn, DqnSettings, DqnShape, SavedDqn, Track, Transition};

@@ -2,7 +2,7 @@
 
 use crate::detached::detached;
 use crate::model::{model_of, shape_of};
-use crate::origin::{Origin, kind_of, no_prior, unfit};
+use crate::origin::{Origin, checkpoint_bytes, decoded, kind_of, no_prior, unfit};
 use crate::refusal::{failed, invalid, refused};
 use crate::threads::{Pool, Threads};
 use emberwatch_belief::brier::{accuracy, brier_score, log_loss};
@@ -12,11 +12,9 @@ use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
 use emberwatch_belief::estimation::scoring::score;
 use emberwatch_learning::beliefs::WorldForm;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners;
 use emberwatch_learning::options::usual;
 use emberwatch_model::frame::FrameError;
 use emberwatch_model::{Frame, Grid, Model, Shape};
-use emberwatch_network::Device;
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -106,8 +104,8 @@ impl Estimators {
         let shape = shape_of(py, grid.0, grid.1)?;
         let kind = kind.map(|name| kind_of(name, true)).transpose()?;
         let model = model.map(model_of).transpose()?;
-        let learned = py.detach(|| learners::read([&*checkpoint], &Device::Cpu));
-        let learned = learned.map_err(|error| refused(py, format!("{error:#}")))?;
+        let path = checkpoint.display().to_string();
+        let learned = decoded(py, &path, &checkpoint_bytes(py, checkpoint)?)?;
         let kind = kind.unwrap_or_else(|| usual(&learned));
         if kind.learned_by.is_none() {
             let got = format!("decisions on the belief '{}': use known(model)", kind.name);
@@ -273,15 +271,20 @@ impl Estimators {
         py: Python<'py>,
         frames: PyReadonlyArray3<'py, u8>,
     ) -> PyResult<(Numbers<'py>, Numbers<'py>)> {
-        let state = self.state(py)?;
+        let mut state = self.state(py)?;
         let all = vec![true; state.worlds.len()];
         let frames = self.frames(py, frames.as_array(), &all)?;
-        let scores = state.worlds.iter().zip(frames.iter().flatten());
-        let scores = scores
-            .filter_map(|(world, frame)| Some(score(world.belief(), &*world.likelihood()?, frame)));
-        let (sums, seen): (Vec<f64>, Vec<f64>) = scores
-            .map(|score| (score.log_likelihood, score.n_seen as f64))
-            .unzip();
+        let State { worlds, threads } = &mut *state;
+        let scored = worlds.iter_mut().zip(frames.iter().flatten());
+        let scored = threads.work(self.origin.is_short(1), |_| {
+            let scores = scored.filter_map(|(world, frame)| {
+                Some(score(world.belief(), &*world.likelihood()?, frame))
+            });
+            scores
+                .map(|score| (score.log_likelihood, score.n_seen as f64))
+                .unzip()
+        });
+        let (sums, seen): (Vec<f64>, Vec<f64>) = scored;
         Ok((sums.into_pyarray(py), seen.into_pyarray(py)))
     }
 }
@@ -295,10 +298,12 @@ impl Estimators {
             .and_then(|names| Ok((names, kind.target(&conditions)?)));
         let (state_names, target_state) = names.map_err(|error| unfit(py, &error))?;
         let mut threads = Pool::default();
-        let worlds = origin.estimators(py, &mut threads, n_worlds, state_names.len())?;
+        let mut worlds = origin.estimators(py, &mut threads, n_worlds, state_names.len())?;
         let of_model = origin.model.as_ref().map(Model::n_observations);
-        let likelihood = worlds.first().and_then(|world| world.likelihood());
-        let of_belief = likelihood.map(|likelihood| likelihood.ncols());
+        let first = worlds.first_mut();
+        let of_belief = threads.work(origin.is_short(1), |_| {
+            first.and_then(|world| Some(world.likelihood()?.ncols()))
+        });
         Ok(Self {
             kind: kind.name,
             n_observations: of_model.or(of_belief).unwrap_or(state_names.len()),

@@ -33,11 +33,13 @@ use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::path::MAX_MOVES;
 use emberwatch_model::task::FIRST_TRAINING_SEED;
 use emberwatch_model::{MAX_RADIUS, MAX_VALUES};
+use emberwatch_network::barrier_pool;
 use pyo3::prelude::*;
 
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     interrupt_when(errors::interrupted);
+    start_candle(module.py())?;
     #[cfg(unix)]
     fork::register(module)?;
     module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
@@ -56,7 +58,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<estimators::Estimators>()?;
     module.add_class::<merit::MeritTally>()?;
     module.add_class::<options::Options>()?;
-    module.add_function(wrap_pyfunction!(options::checkpoint_bytes, module)?)?;
+    module.add_function(wrap_pyfunction!(origin::checkpoint_bytes, module)?)?;
     module.add_function(wrap_pyfunction!(options::estimator_names, module)?)?;
     module.add_function(wrap_pyfunction!(options::option_names, module)?)?;
     module.add_function(wrap_pyfunction!(origin::belief_kinds, module)?)?;
@@ -78,4 +80,20 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(model::read_model, module)?)?;
     module.add_function(wrap_pyfunction!(planning::beam_search, module)?)?;
     module.add_function(wrap_pyfunction!(refusal::explain, module)?)
+}
+
+/// Starts candle's own pool without threads, so that candle computes on the calling thread. A forked child would wait
+/// for ever for such threads, because a fork copies none. candle reads their number from the environment once, here. The
+/// variable is then restored, because other libraries and child processes may read it.
+fn start_candle(py: Python<'_>) -> PyResult<()> {
+    let name = "CANDLE_NUM_THREADS";
+    let environment = py.import("os")?.getattr("environ")?;
+    let before = environment.call_method1("get", (name,))?;
+    environment.set_item(name, "1")?;
+    barrier_pool();
+    if before.is_none() {
+        environment.del_item(name)
+    } else {
+        environment.set_item(name, before)
+    }
 }

@@ -5,6 +5,7 @@ use crate::belief::first_belief;
 use crate::connection::checked;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
+use crate::origin::decoded;
 use crate::owned::Owned;
 use crate::planned_worlds::{Observed, PlannedWorlds, Watched};
 use crate::refusal::{invalid, refused};
@@ -13,16 +14,12 @@ use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::feature_names;
 use emberwatch_learning::beliefs::{self, BeliefKind};
-use emberwatch_learning::checkpoint::read_bytes;
 use emberwatch_learning::config::{AgentConfig, PriorKind};
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners;
 use emberwatch_learning::options::{Crew, usual};
 use emberwatch_model::{Description, Model};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
-use std::borrow::Cow;
-use std::path::PathBuf;
 use std::sync::OnceLock;
 
 /// The features and the paths of plans.
@@ -43,14 +40,6 @@ pub fn estimator_names() -> Vec<(&'static str, &'static str)> {
     let serves = |kind: &&BeliefKind| beliefs::of_options(kind.name).is_ok();
     let kinds = beliefs::BELIEFS.iter().copied().filter(serves);
     kinds.map(|kind| (kind.name, kind.about)).collect()
-}
-
-/// Returns the bytes of a checkpoint, to be read only once.
-#[pyfunction]
-pub fn checkpoint_bytes(py: Python<'_>, path: PathBuf) -> PyResult<Cow<'static, [u8]>> {
-    let bytes = py.detach(|| read_bytes(&path));
-    let bytes = bytes.map_err(|error| refused(py, format!("{error:#}")))?;
-    Ok(bytes.into())
 }
 
 /// The attributes of Python's `WorldSpec` that beliefs and plans depend on.
@@ -107,8 +96,7 @@ impl Options {
             invalid(py, "prior", "'simulated', 'initial' or 'uniform'", got)
         })?;
         let learned = checkpoint.map_or(Ok(Learned::default()), |(path, bytes)| {
-            let learned = py.detach(|| learners::from_bytes(&bytes));
-            learned.map_err(|error| refused(py, format!("checkpoint {path}: {error:#}")))
+            decoded(py, &path, &bytes)
         })?;
         let shape = shape_of(py, spec.height, spec.width)?;
         let kind_of_belief = estimator.unwrap_or_else(|| usual(&learned));

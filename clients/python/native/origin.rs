@@ -9,9 +9,13 @@ use emberwatch_belief::estimation::estimator::Estimator;
 use emberwatch_learning::beliefs::{
     AUTOENCODER, BELIEFS, BeliefKind, Conditions, Input, KNOWN, NEURAL, NEURAL_SENSOR, named,
 };
+use emberwatch_learning::checkpoint::read_bytes;
 use emberwatch_learning::learned::Learned;
+use emberwatch_learning::learners;
 use emberwatch_model::{Model, ModelError, Shape};
 use pyo3::prelude::*;
+use std::borrow::Cow;
+use std::path::PathBuf;
 
 /// The kind and the sources of beliefs.
 pub struct Origin {
@@ -61,7 +65,7 @@ impl Origin {
         // Every kind needs memory for at least a belief and a predictor. The first estimator, once built, reports how
         // much it needs in total.
         memory(2 * n_states * self.shape.n_cells() * size_of::<f32>())?;
-        let first = py.detach(|| self.estimator());
+        let first = py.detach(|| threads.work(self.is_short(1), |_| self.estimator()));
         let first = first.map_err(|error| unfit(py, &error))?;
         let (expected, got) = (self.shape, first.belief().shape());
         if got != expected {
@@ -79,11 +83,32 @@ impl Origin {
     }
 
     /// Returns whether a step is too short to divide among threads, as with the plain filter or a single world. Never
-    /// true for networks, because they divide their own work among threads, and must find the pool's threads there.
+    /// true for networks.
     pub fn is_short(&self, n_worlds: usize) -> bool {
-        let is_network = [&NEURAL, &NEURAL_SENSOR, &AUTOENCODER].contains(&self.kind);
-        *self.kind == KNOWN || (n_worlds <= 1 && !is_network)
+        *self.kind == KNOWN || (n_worlds <= 1 && !is_network(self.kind))
     }
+}
+
+/// Returns whether beliefs of this kind divide their own work among threads. All their work must run on a [`Pool`], as
+/// they would use rayon's global pool elsewhere.
+pub fn is_network(kind: &BeliefKind) -> bool {
+    [NEURAL, NEURAL_SENSOR, AUTOENCODER].contains(kind)
+}
+
+/// Returns the bytes of a checkpoint, to be read only once.
+#[pyfunction]
+pub fn checkpoint_bytes(py: Python<'_>, path: PathBuf) -> PyResult<Cow<'static, [u8]>> {
+    let bytes = py.detach(|| read_bytes(&path));
+    let bytes = bytes.map_err(|error| refused(py, format!("{error:#}")))?;
+    Ok(bytes.into())
+}
+
+/// Decodes the learned values of a checkpoint. `path` names it in errors. Some networks compute when they are created,
+/// so this needs a pool.
+pub fn decoded(py: Python<'_>, path: &str, bytes: &[u8]) -> PyResult<Learned> {
+    let decode = |_| learners::from_bytes(bytes);
+    let learned = py.detach(|| Pool::default().work(false, decode));
+    learned.map_err(|error| refused(py, format!("checkpoint {path}: {error:#}")))
 }
 
 fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {

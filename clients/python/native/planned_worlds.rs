@@ -1,13 +1,13 @@
 //! Single-robot worlds with their beliefs and plans: belief updates, planning, and publishing to observers.
 
 use crate::answer::RESULT_BYTES;
+use crate::origin::is_network;
 use crate::threads::{Pool, Threads};
 use crate::wire::{Feed, View};
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
-use emberwatch_learning::beliefs::NEURAL;
 use emberwatch_learning::options::{Crew, Planned, Shown};
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::instance::Instance;
@@ -289,10 +289,9 @@ impl WorldWork<'_> {
     }
 }
 
-/// Returns whether the work is too short to divide among threads, as with a single world. Never true for networks,
-/// because they divide their own work among threads, and must find the pool's threads there.
+/// Returns whether the work is too short to divide among threads, as with a single world. Never true for networks.
 fn is_short(crew: &Crew, n_worlds: usize) -> bool {
-    n_worlds == 1 && *crew.estimator() != NEURAL
+    n_worlds <= 1 && !is_network(crew.estimator())
 }
 
 fn no_such_world(n_worlds: usize, got: usize) -> String {

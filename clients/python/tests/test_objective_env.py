@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import multiprocessing
-import os
 import re
 import subprocess
-import warnings
 from pathlib import Path
 from typing import Any, get_args
 
@@ -225,32 +222,6 @@ def test_resume_after_an_unfinished_step_has_all_frames(
     found, info = one.reset(options={"resume": True})
     assert np.all(info["step"] == 2)
     assert_same(found, seen)
-
-
-def test_a_forked_child_plans_on_its_own_threads(checkpoints: Path) -> None:
-    keywords = believing("neural", checkpoints)
-    envs = make_vec(2, **keywords)
-    expected = rollout(envs, 3, seed=1000)
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe()
-
-    def child() -> None:
-        again = make_vec(2, **keywords)
-        sender.send([step[0] for step in rollout(again, 3, seed=1000)])
-        try:
-            envs.step(np.zeros(2, int))
-        except emberwatch.EmberwatchError as error:
-            sender.send(error.code)
-        os._exit(0)
-
-    process = context.Process(target=child)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # about forks with threads
-        process.start()
-    assert receiver.poll(60)
-    assert_same(receiver.recv(), [step[0] for step in expected])
-    assert receiver.recv() == "forked"
-    process.join()
 
 
 def test_the_exploit_option_flies_like_the_exploit_policy() -> None:
