@@ -21,6 +21,7 @@ mod hostile;
 mod kills;
 mod land;
 mod lease;
+mod logging;
 mod places;
 mod python;
 #[expect(dead_code, reason = "the example's own main")]

@@ -5,6 +5,7 @@ use crate::process::set_up_process;
 use clap::{Parser, Subcommand};
 use emberwatch_learning::policy;
 use emberwatch_protocol::limits::threads::NoThreads;
+use emberwatch_protocol::program::start_logging;
 use rayon::ThreadPoolBuilder;
 use std::process::ExitCode;
 
@@ -36,8 +37,8 @@ enum Command {
 /// Parses the arguments, runs the subcommand, and returns the exit code.
 pub fn main() -> ExitCode {
     set_up_process();
-    emberwatch_protocol::program::start_logging();
     let command = Cli::parse().command;
+    let _log = start_logging();
     if let Err(error) = start_threads() {
         tracing::error!("{error}");
         return ExitCode::FAILURE;

@@ -1,11 +1,9 @@
 //! The subcommands: each parses flags, calls the library and prints the result.
 
-mod print;
 mod record;
 mod running;
 mod snapshots;
 
-pub use print::print;
 pub use record::RecordCommand;
 pub use running::{StatusCommand, StopCommand};
 pub use snapshots::{ForkCommand, RestoreCommand, SnapshotCommand};

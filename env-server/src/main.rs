@@ -4,7 +4,7 @@ mod commands;
 
 use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
-use emberwatch_protocol::program::{start_logging, stop_on_signals};
+use emberwatch_protocol::program::{print, start_logging, stop_on_signals};
 use emberwatch_server::flags::ServerFlags;
 use emberwatch_server::server::{announce_reach, serve};
 use std::process::ExitCode;
@@ -46,8 +46,9 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    start_logging();
-    match run(&Cli::parse()) {
+    let cli = Cli::parse();
+    let _log = start_logging();
+    match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             tracing::error!("{error:#}");
@@ -68,7 +69,7 @@ fn run(cli: &Cli) -> Result<()> {
             let checked = cli.flags.effective()?.check()?;
             if cli.check {
                 announce_reach(&checked.reach);
-                return commands::print(&toml::to_string(&checked.config)?);
+                return Ok(print(&toml::to_string(&checked.config)?)?);
             }
             let stop = stop_on_signals().context("handle signals")?;
             serve(checked, &stop, cli.exit_with)

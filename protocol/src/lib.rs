@@ -11,6 +11,8 @@
 //! once. A *frame* contains the observations of a step. A *lease* is the right to fly robots.
 
 #[cfg(feature = "program")]
+mod logging;
+#[cfg(feature = "program")]
 pub mod program;
 pub mod throttle;
 mod wire;

@@ -1,35 +1,35 @@
-//! Start-up code of every program: logging to standard error, and stopping on signals or when another process ends.
+//! Code of every program: printing, and stopping on signals or when another process ends.
 
 use emberwatch_messages::limits::threads::spawn;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::exit;
-use std::io::IsTerminal;
+use std::io::{Error, ErrorKind, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use tracing_subscriber::filter::{LevelFilter, Targets};
-use tracing_subscriber::prelude::*;
 
+pub use crate::logging::{Log, start_logging};
 pub use crate::wire::process::{NotWatched, WatchedProcess, node_pid};
 pub use emberwatch_messages::process::pid_namespace;
 pub use emberwatch_model::text::{MAX_TEXT_BYTES, read_text};
 
 const SAME_SIGNAL: Duration = Duration::from_millis(500);
 
-/// Starts logging to standard error. `RUST_LOG` sets the level, also per target (`warn`,
-/// `warn,emberwatch_agent=debug`); the default is `info`.
-pub fn start_logging() {
-    let wanted = std::env::var("RUST_LOG");
-    let filter = wanted.ok().and_then(|text| text.parse::<Targets>().ok());
-    let filter = filter.unwrap_or_else(|| Targets::new().with_default(LevelFilter::INFO));
-    let log = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
-        .with_target(false)
-        .with_ansi(std::io::stderr().is_terminal());
-    tracing_subscriber::registry()
-        .with(log.with_filter(filter))
-        .init();
+/// Prints a text to standard output. A reader that has closed its end, as `head` does, is no error: it needs no more.
+///
+/// # Errors
+/// If the text cannot be written for another reason.
+pub fn print(text: &str) -> std::io::Result<()> {
+    let mut out = std::io::stdout();
+    let printed = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    match printed {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            let problem = format!("write to standard output: {error}");
+            Err(Error::new(error.kind(), problem))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Returns a flag that SIGINT, SIGTERM or SIGHUP sets. A second signal ends the process at once. `timeout` and shells
@@ -50,6 +50,6 @@ pub fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
             }
         }
     };
-    spawn("signals", wait).map_err(std::io::Error::other)?;
+    spawn("signals", wait).map_err(Error::other)?;
     Ok(stop)
 }

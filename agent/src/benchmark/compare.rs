@@ -57,7 +57,7 @@ pub struct Results {
 pub fn compare(
     arena: &mut Arena,
     comparison: &Comparison,
-    progress: &dyn Fn(&str, u64),
+    progress: &mut dyn FnMut(&str, u64),
 ) -> Result<Results> {
     let config = &comparison.config;
     let prior = config.prior(arena.info().burn_in);

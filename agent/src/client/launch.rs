@@ -191,7 +191,7 @@ fn private(program: PathBuf) -> Command {
         // Ctrl-C in a terminal must not reach the program, because this process still needs the program while it shuts
         // down.
         .process_group(0);
-    if std::env::var_os("RUST_LOG").is_none() {
+    if std::env::var_os("RUST_LOG").is_none_or(|value| value.is_empty()) {
         command.env("RUST_LOG", "warn");
     }
     command

@@ -26,12 +26,15 @@ use emberwatch_network::DeviceKind;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::MAX_ROBOTS;
 use emberwatch_protocol::control::ServerInfo;
-use indicatif::{ProgressBar, ProgressStyle};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// The name that stands for all policies of [`policy::options_table`].
 const OPTIONS: &str = "options";
+
+/// Maximum time between two lines about the progress.
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(10);
 
 /// The default policy for comparisons of teams.
 const TEAM_POLICY: &str = "beam_exploit";
@@ -336,23 +339,19 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
     ladder
 }
 
-/// Runs a comparison with a progress bar.
+/// Runs a comparison and logs its progress.
 pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
     let n_contestants = comparison.contestants(&arena.model).len() as u64;
     let n_steps = n_contestants * n_seeds * comparison.steps;
-    let bar = progress_bar(n_steps);
-    let results = compare(arena, comparison, &|policy, steps| {
-        if bar.message() != policy {
-            if bar.is_hidden() {
-                tracing::info!(policy, done = bar.position(), of = n_steps, "comparing");
-            }
-            bar.set_message(policy.to_owned());
+    let (mut done, mut logged, mut last_policy) = (0, Instant::now(), String::new());
+    compare(arena, comparison, &mut |policy, steps| {
+        if last_policy != policy || logged.elapsed() > PROGRESS_INTERVAL {
+            tracing::info!(policy, done, of = n_steps, "comparing");
+            (logged, last_policy) = (Instant::now(), policy.to_owned());
         }
-        bar.inc(steps);
-    });
-    bar.finish_and_clear();
-    results
+        done += steps;
+    })
 }
 
 fn axis_label(model: &Model) -> String {
@@ -364,10 +363,4 @@ fn axis_label(model: &Model) -> String {
         (name, true) => format!("distinct {name} cells found per step"),
         (_, false) => "reward per step".into(),
     }
-}
-
-fn progress_bar(n_steps: u64) -> ProgressBar {
-    let style = "{msg:22} [{bar:32}] {percent:>3} %  {per_sec:.0}  {eta_precise} left";
-    let style = ProgressStyle::with_template(style).expect("invariant: the template is valid");
-    ProgressBar::new(n_steps).with_style(style.progress_chars("=> "))
 }

@@ -8,8 +8,8 @@ use emberwatch_learning::file::check_replaceable;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::program::print;
 use emberwatch_protocol::task::Task;
-use std::io::Write;
 use std::ops::Range;
 use std::path::Path;
 use std::str::FromStr;
@@ -104,8 +104,5 @@ pub fn check_csv(path: &Path) -> Result<()> {
 }
 
 pub fn write(text: &str) -> Result<()> {
-    let mut out = std::io::stdout();
-    out.write_all(text.as_bytes())
-        .and_then(|()| out.write_all(b"\n"))
-        .context("write to standard output")
+    Ok(print(&format!("{text}\n"))?)
 }

@@ -5,8 +5,7 @@ use clap::Parser;
 use emberwatch_dashboard::scene::{Scene, Stage};
 use emberwatch_dashboard::{access, player, server, watcher};
 use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::program::{WatchedProcess, start_logging, stop_on_signals};
-use std::io::Write;
+use emberwatch_protocol::program::{WatchedProcess, print, start_logging, stop_on_signals};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -51,8 +50,9 @@ struct Cli {
 }
 
 fn main() -> ExitCode {
-    start_logging();
-    match run(&Cli::parse()) {
+    let cli = Cli::parse();
+    let _log = start_logging();
+    match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             tracing::error!("{error:#}");
@@ -117,10 +117,7 @@ fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<(Arc<Stage>, Vec<JoinHandl
 /// Prints the page's address, and opens the page if asked.
 fn announce(address: SocketAddr, open: bool) -> Result<()> {
     let url = format!("http://{address}/");
-    let mut out = std::io::stdout();
-    writeln!(out, "{url}")
-        .and_then(|()| out.flush())
-        .context("write to standard output")?;
+    print(&format!("{url}\n"))?;
     if open {
         let opener = std::process::Command::new("xdg-open").arg(&url).spawn();
         if let Err(error) = opener {

@@ -1,11 +1,11 @@
 //! `status` and `stop`: requests to a running server.
 
-use super::print::print;
 use anyhow::Result;
 use clap::Args;
 use emberwatch_protocol::Connection;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::control::{Reply, Request, ServerInfo, ServerStatus};
+use emberwatch_protocol::program::print;
 use serde::Serialize;
 use std::time::Duration;
 
@@ -53,9 +53,9 @@ impl StatusCommand {
             Reply::Status(status) if self.target.json => {
                 let task = info.task.as_deref();
                 let named = NamedStatus { task, status };
-                print(&(serde_json::to_string_pretty(&named)? + "\n"))
+                Ok(print(&(serde_json::to_string_pretty(&named)? + "\n"))?)
             }
-            Reply::Status(status) => print(&describe(&self.target.instance, &info, &status)),
+            Reply::Status(status) => Ok(print(&describe(&self.target.instance, &info, &status))?),
             other => anyhow::bail!("expected a status, got {other:?}"),
         }
     }

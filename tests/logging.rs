@@ -1,0 +1,250 @@
+//! The output of the programs: a reader that pauses or leaves stops none of them, and colours follow the environment.
+
+use crate::commands::TINY;
+use emberwatch_protocol::Connection;
+use emberwatch_protocol::channels::Instance;
+use emberwatch_protocol::control::Request;
+use rustix::pipe::fcntl_setpipe_size;
+use rustix::process::{Pid, Signal, kill_process};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{Action, tcflow};
+use std::fs::File;
+use std::io::{BufRead, BufReader, PipeReader, Read, Write, pipe};
+use std::net::TcpStream;
+use std::os::fd::OwnedFd;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use tests::harness::{
+    AGENT, PATIENCE, SERVER, SMALL, Server, eventually, new_instance, program_path,
+};
+
+/// Size of a small pipe, in bytes.
+const PIPE: usize = 4096;
+
+/// Number of refused requests whose log exceeds what the server keeps for a reader that pauses.
+const N_REFUSED: usize = 14_000;
+
+fn start(name: &str, arguments: &str, stdout: Stdio, stderr: impl Into<Stdio>) -> Child {
+    let mut command = Command::new(program_path(name));
+    command
+        .args(arguments.split_whitespace())
+        .env("RUST_LOG", "debug");
+    command.stdin(Stdio::null()).stdout(stdout).stderr(stderr);
+    command.spawn().expect("start the program")
+}
+
+/// Waits until a program ends. Kills it if that takes too long.
+fn wait(mut child: Child) -> ExitStatus {
+    if !eventually(PATIENCE, || !matches!(child.try_wait(), Ok(None))) {
+        let _ = child.kill();
+    }
+    child.wait().expect("a child process")
+}
+
+fn open_terminal() -> (File, File) {
+    let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
+    grantpt(&terminal).expect("a terminal");
+    unlockpt(&terminal).expect("a terminal");
+    let name = ptsname(&terminal, Vec::new()).expect("a name");
+    let name = name.to_str().expect("ASCII");
+    let end = File::options().read(true).write(true).open(name);
+    (terminal.into(), end.expect("open the terminal"))
+}
+
+/// A pipe without room for a single byte, and its reader, which must stay open.
+fn full_pipe() -> (OwnedFd, OwnedFd) {
+    let (reader, mut writer) = pipe().expect("a pipe");
+    let size = fcntl_setpipe_size(&writer, PIPE).expect("a small pipe");
+    writer.write_all(&vec![b'\n'; size]).expect("fill the pipe");
+    (reader.into(), writer.into())
+}
+
+/// A terminal in which Ctrl-S was pressed.
+fn paused_terminal() -> (OwnedFd, OwnedFd) {
+    let (terminal, end) = open_terminal();
+    tcflow(&end, Action::OOff).expect("pause");
+    (terminal.into(), end.into())
+}
+
+fn connect(instance: &Instance) -> Connection {
+    let mut connection = None;
+    let connects = || {
+        connection = Connection::open(instance, "tests", PATIENCE).ok();
+        connection.is_some()
+    };
+    assert!(eventually(PATIENCE, connects), "no answer");
+    connection.expect("checked above")
+}
+
+/// Reads the page of a dashboard.
+fn page(url: &str) -> String {
+    let address = url
+        .trim()
+        .trim_start_matches("http://")
+        .trim_end_matches('/');
+    let mut stream = TcpStream::connect(address).expect("connect");
+    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+    // A request for another host is refused and logged.
+    let request = format!("GET / HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).expect("request");
+    let mut text = String::new();
+    stream.read_to_string(&mut text).expect("a page");
+    text
+}
+
+#[test]
+fn an_unread_log_stops_no_program() {
+    for unread in [full_pipe, paused_terminal] {
+        let (_reader, log) = unread();
+        let stderr = || log.try_clone().expect("a file descriptor");
+        let instance = new_instance();
+        let flags = format!("--instance {} {SMALL}", instance.name());
+        let server = start(SERVER, &flags, Stdio::null(), stderr());
+        let mut connection = connect(&instance);
+
+        let flags = format!("--instance {} --listen 127.0.0.1:0", instance.name());
+        let mut dashboard = start("emberwatch-dashboard", &flags, Stdio::piped(), stderr());
+        let mut url = String::new();
+        let out = dashboard.stdout.take().expect("piped");
+        BufReader::new(out).read_line(&mut url).expect("a line");
+        assert!(page(&url).contains("200 OK"), "{url}");
+        let pid = Pid::from_raw(dashboard.id() as i32).expect("a process id");
+        kill_process(pid, Signal::TERM).expect("stop the dashboard");
+        assert!(wait(dashboard).success());
+
+        let agent = start(AGENT, &format!("compare {TINY}"), Stdio::null(), stderr());
+        assert!(wait(agent).success());
+
+        let stopped = connection.control(&Request::Shutdown {}, PATIENCE);
+        stopped.expect("an answer");
+        assert!(wait(server).success());
+    }
+}
+
+#[test]
+fn dropped_lines_are_counted_and_reported() {
+    let (mut reader, mut writer): (PipeReader, _) = pipe().expect("a pipe");
+    let size = fcntl_setpipe_size(&writer, PIPE).expect("a small pipe");
+    writer.write_all(&vec![b'\n'; size]).expect("fill the pipe");
+    let instance = new_instance();
+    let flags = format!("--instance {} {SMALL}", instance.name());
+    let server = start(SERVER, &flags, Stdio::null(), writer);
+    let mut connection = connect(&instance);
+    for _ in 0..N_REFUSED {
+        let refused = connection.control(&Request::Renew { lease: 1 }, PATIENCE);
+        refused.expect_err("no lease");
+    }
+    let mut log = vec![0; size];
+    reader.read_exact(&mut log).expect("what filled the pipe");
+    let stopped = connection.control(&Request::Shutdown {}, PATIENCE);
+    stopped.expect("an answer");
+    let mut log = String::new();
+    reader.read_to_string(&mut log).expect("the log");
+    assert!(wait(server).success());
+    let n_logged = log.matches("refused a control request").count();
+    let report = log.lines().find(|line| line.contains("lines were dropped"));
+    let n_dropped = report.and_then(|line| line.split(' ').next()?.parse::<usize>().ok());
+    assert!(n_logged < N_REFUSED);
+    assert_eq!(n_dropped.map(|dropped| n_logged + dropped), Some(N_REFUSED));
+    assert!(log.trim_end().ends_with("stopped n_steps=0"), "{report:?}");
+}
+
+#[test]
+fn colours_follow_the_terminal_and_the_environment() {
+    for (environment, on_terminal, elsewhere) in [
+        ("TERM=xterm", true, false),
+        ("TERM=dumb", false, false),
+        ("NO_COLOR=1", false, false),
+        ("NO_COLOR=", true, false),
+        ("CLICOLOR_FORCE=1", true, true),
+        ("CLICOLOR_FORCE=0", true, false),
+        ("TERM=dumb CLICOLOR_FORCE=1", true, true),
+        ("NO_COLOR=1 CLICOLOR_FORCE=1", false, false),
+    ] {
+        let variables = environment.split(' ').map(|set| set.split_once('='));
+        let log_on = |stderr: OwnedFd| {
+            Command::new(program_path(SERVER))
+                .args(["--check", "--worlds", "0"])
+                .env("TERM", "xterm")
+                .env_remove("NO_COLOR")
+                .env_remove("CLICOLOR_FORCE")
+                .envs(variables.clone().flatten())
+                .stderr(stderr)
+                .status()
+                .expect("run the server");
+        };
+        let (mut terminal, end) = open_terminal();
+        log_on(end.into());
+        let mut seen = Vec::new();
+        // A terminal whose other end is closed answers with an error.
+        let _ = terminal.read_to_end(&mut seen);
+        let (mut reader, writer) = pipe().expect("a pipe");
+        log_on(writer.into());
+        let mut piped = Vec::new();
+        reader.read_to_end(&mut piped).expect("the log");
+        let are_coloured = [seen, piped].map(|log| {
+            assert!(
+                String::from_utf8_lossy(&log).contains("worlds"),
+                "{environment}"
+            );
+            log.contains(&b'\x1b')
+        });
+        assert_eq!(are_coloured, [on_terminal, elsewhere], "{environment}");
+    }
+}
+
+#[test]
+fn unusable_levels_are_named_once_and_the_default_holds() {
+    for (level, n_warnings) in [
+        (None, 0),
+        (Some(""), 0),
+        (Some(" , "), 0),
+        (Some("emberwatch"), 0),
+        (Some("warn,emberwatch_server=info,tokio=warn"), 0),
+        (Some("inof"), 1),
+        (Some("info,emberwatch-server=debug"), 1),
+        (Some("emberwatch_sever=info"), 1),
+        (Some("info=info=info"), 1),
+    ] {
+        let mut command = Command::new(program_path(SERVER));
+        command.args(["status", "--instance", "nobody"]);
+        command
+            .env_remove("RUST_LOG")
+            .envs(level.map(|level| ("RUST_LOG", level)));
+        let log = command.output().expect("run the server").stderr;
+        let log = String::from_utf8(log).expect("text");
+        assert_eq!(
+            log.matches("RUST_LOG: expected").count(),
+            n_warnings,
+            "{level:?}: {log}"
+        );
+        assert_eq!(log.matches("ERROR").count(), 1, "{level:?}: {log}");
+    }
+}
+
+#[test]
+fn readers_that_leave_end_programs_silently() {
+    let server = Server::start(SMALL);
+    let instance = format!("--instance {}", server.instance.name());
+    for (program, arguments) in [
+        (SERVER, "--help"),
+        (SERVER, "--check"),
+        (SERVER, &format!("status {instance}")),
+        (SERVER, &format!("status --json {instance}")),
+        (AGENT, "train --help"),
+        (AGENT, "compare --policies help"),
+        (AGENT, "suite --policies help"),
+        (AGENT, &format!("compare {TINY}")),
+        ("emberwatch-dashboard", "--version"),
+    ] {
+        let (reader, writer) = pipe().expect("a pipe");
+        drop(reader);
+        let child = start(program, arguments, writer.into(), Stdio::piped());
+        let ended = child.wait_with_output().expect("run the program");
+        let log = String::from_utf8_lossy(&ended.stderr);
+        assert!(ended.status.success(), "{program} {arguments}: {log}");
+        let is_silent = ["ERROR", "panicked", "pipe"]
+            .iter()
+            .all(|word| !log.contains(word));
+        assert!(is_silent, "{program} {arguments}: {log}");
+    }
+}
