@@ -200,18 +200,20 @@ pub fn simulated_prior<'py>(
     Ok(belief.probabilities().to_pyarray(py))
 }
 
-/// Returns the belief before the first frame. Caches a simulated belief in a file for later processes.
+/// Returns the belief before the first frame. Caches a simulated belief in a file for other processes. Ctrl-C ends the
+/// wait for another process that simulates it.
 pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
     let is_simulated = matches!(prior, Prior::Simulated { .. });
     let kept = is_simulated.then(|| KeptBelief::new(prior, model, shape, 0));
-    let kept = kept.flatten();
-    if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
-        return Ok(belief);
+    let pause = |time| {
+        py.detach(|| std::thread::sleep(time));
+        py.check_signals()
+    };
+    let make = || simulated(py, prior, model, shape);
+    match kept.flatten() {
+        Some(kept) => kept.read_or_make(pause, make),
+        None => make(),
     }
-    let belief = simulated(py, prior, model, shape)?;
-    // If the file cannot be written, a later process simulates the belief again.
-    let _ = kept.map(|kept| kept.write(&belief));
-    Ok(belief)
 }
 
 /// Simulates a prior on new threads, because a global pool is unusable after a fork. Ctrl-C ends the simulation.

@@ -18,6 +18,7 @@ use emberwatch_model::{Frame, Grid, Model, Shape};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
+use pyo3::types::PyTuple;
 use std::any::Any;
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
@@ -204,17 +205,22 @@ impl Estimators {
         });
         let n_worlds = corrected.len();
         let refused = corrected.into_iter().enumerate();
-        let mut refused = refused.filter_map(|(world, result)| Some((world, result.err()?)));
-        refused.next().map_or(Ok(()), |(world, error)| {
-            let error = anyhow::Error::from(error);
-            let of_world = format!("world {world}");
-            let error = if n_worlds > 1 {
-                error.context(of_world)
-            } else {
-                error
-            };
-            Err(raise(py, &error))
-        })
+        let refused = refused.filter_map(|(world, result)| Some((world, result.err()?)));
+        let (refused, errors): (Vec<usize>, Vec<_>) = refused.unzip();
+        let Some(first) = errors.into_iter().next() else {
+            return Ok(());
+        };
+        let error = anyhow::Error::from(first);
+        let error = if n_worlds > 1 {
+            error.context(named(&refused))
+        } else {
+            error
+        };
+        let raised = raise(py, &error);
+        raised
+            .value(py)
+            .setattr("worlds", PyTuple::new(py, refused)?)?;
+        Err(raised)
     }
 
     /// Predicts: moves the beliefs about the chosen worlds from X_k to X_{k+1}.
@@ -366,6 +372,18 @@ impl Estimators {
         let expected = format!("a value below {n_observations}, or 255");
         invalid(py, subject, expected, value)
     }
+}
+
+/// Names worlds for an error: all, or the first eight and how many more.
+fn named(worlds: &[usize]) -> String {
+    let (shown, more) = worlds.split_at(worlds.len().min(8));
+    let numbers: Vec<String> = shown.iter().map(usize::to_string).collect();
+    let plural = if worlds.len() > 1 { "s" } else { "" };
+    let more = match more.len() {
+        0 => String::new(),
+        n => format!(" and {n} more"),
+    };
+    format!("world{plural} {}{more}", numbers.join(", "))
 }
 
 /// Predicts the beliefs about all worlds, in one batch if the kind of estimator supports it.

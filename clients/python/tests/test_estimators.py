@@ -323,6 +323,18 @@ def test_an_impossible_frame_names_its_world() -> None:
     many = belief.known(sharp, prior=prior, n_worlds=2)
     with fails("impossible_frame", match=r"world 1: frame: cell \(0, 1\): .* allows, got 2"):
         many.correct(np.array([[[0, 255]], [[255, 2]]], np.uint8))
+    for n, words in (
+        (3, "worlds 0, 2: frame"),
+        (20, r"worlds 0, 2, 4, 6, 8, 10, 12, 14 and 2 more: "),
+    ):
+        several = belief.known(sharp, prior=prior, n_worlds=n)
+        frames = np.full((n, 1, 2), 255, np.uint8)
+        frames[::2, 0, 1] = 2
+        frames[1::2, 0, 1] = 0
+        with fails("impossible_frame", match=words) as refused:
+            several.correct(frames)
+        assert refused.value.worlds == tuple(range(0, n, 2))
+        assert (several.belief == prior[:, None]).all()
     one = belief.known(sharp, prior=prior)
     with fails("impossible_frame", match=r"^frame: cell \(0, 1\)"):
         one.correct(np.array([[255, 2]], np.uint8))

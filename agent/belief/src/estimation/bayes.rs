@@ -2,7 +2,7 @@
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::grid::Probabilities;
-use emberwatch_model::{Cell, Frame};
+use emberwatch_model::{Cell, Frame, Shape};
 use ndarray::{Array2, NdFloat};
 use thiserror::Error;
 
@@ -25,6 +25,16 @@ pub struct Impossible<T> {
     pub observed: u8,
     /// The belief about the cell, one probability per state.
     pub belief: Vec<T>,
+}
+
+impl ZeroEvidence {
+    fn of(impossible: Impossible<f32>, shape: Shape) -> Self {
+        Self {
+            cell: shape.cell(impossible.index),
+            observed: impossible.observed,
+            belief: impossible.belief,
+        }
+    }
 }
 
 /// Computes the distribution of each cell's observation under a belief, `B' u`, shape `[O, H, W]`. `likelihood` is
@@ -61,11 +71,17 @@ pub fn correct(
     let dim = frame.values().dim();
     assert_eq!(dim, shape.dim(), "frame: expected the belief's grid");
     let corrected = correct_cells(belief.as_mut_slice(), likelihood, || frame.observed());
-    corrected.map_err(|impossible| ZeroEvidence {
-        cell: shape.cell(impossible.index),
-        observed: impossible.observed,
-        belief: impossible.belief,
-    })
+    corrected.map_err(|impossible| ZeroEvidence::of(impossible, shape))
+}
+
+/// Checks that [`correct`] accepts a frame.
+///
+/// # Errors
+/// [`ZeroEvidence`] if `b(y)' u = 0` for some cell.
+pub fn check(belief: &Belief, likelihood: &Array2<f64>, frame: &Frame) -> Result<(), ZeroEvidence> {
+    let posteriors = posteriors(belief.as_slice(), likelihood, frame.observed());
+    let possible = posteriors.map(drop);
+    possible.map_err(|impossible| ZeroEvidence::of(impossible, belief.shape()))
 }
 
 /// Applies Bayes' rule as [`correct`] does, but to any list of cells. `probabilities` contains one contiguous block of
@@ -84,8 +100,23 @@ pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
     let n_states = likelihood.nrows();
     let n_cells = probabilities.len() / n_states;
     // Posteriors are written back only after all observations have proved possible.
+    let posteriors = posteriors(probabilities, likelihood, observed())?;
+    for ((index, _), posterior) in observed().zip(posteriors.chunks_exact(n_states)) {
+        let cell = probabilities[index..].iter_mut().step_by(n_cells);
+        cell.zip(posterior).for_each(|(to, &p)| *to = p);
+    }
+    Ok(())
+}
+
+/// Returns the posterior of each observed cell, one cell after another.
+fn posteriors<T: NdFloat>(
+    probabilities: &[T],
+    likelihood: &Array2<f64>,
+    observed: impl Iterator<Item = (usize, u8)>,
+) -> Result<Vec<T>, Impossible<T>> {
+    let n_cells = probabilities.len() / likelihood.nrows();
     let mut posteriors: Vec<T> = Vec::new();
-    for (index, observed) in observed() {
+    for (index, observed) in observed {
         let prior = probabilities[index..].iter().step_by(n_cells);
         let likelihood = likelihood.column(usize::from(observed));
         // Compute in f64, because the product of two f32 values can underflow to zero in f32, but not in f64.
@@ -104,9 +135,5 @@ pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
         let posterior = joint().map(|p| T::from(p / evidence).unwrap_or_else(T::nan));
         posteriors.extend(posterior);
     }
-    for ((index, _), posterior) in observed().zip(posteriors.chunks_exact(n_states)) {
-        let cell = probabilities[index..].iter_mut().step_by(n_cells);
-        cell.zip(posterior).for_each(|(to, &p)| *to = p);
-    }
-    Ok(())
+    Ok(posteriors)
 }

@@ -18,6 +18,9 @@ use thiserror::Error;
 pub trait Estimator: Send + Any {
     /// Corrects the belief with the frame of X_k (eq. 5).
     ///
+    /// Robots over one cell in the same step read the same value. Merge their frames first, as in a team frame: two
+    /// corrections would count one reading twice.
+    ///
     /// # Errors
     /// If the frame is impossible under the belief. The belief is then unchanged.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError>;

@@ -1,16 +1,17 @@
 //! A cache of simulated priors in the user's cache folder. Each file contains a key, the probabilities and a checksum.
-//! If a file or the folder is unusable, the caller simulates the prior again.
+//! While one process simulates a prior, others that need it wait. If a file or the folder is unusable, each simulates
+//! the prior itself.
 
 use crate::estimation::belief::Belief;
 use crate::estimation::prior::Prior;
 use emberwatch_model::grid::{Probabilities, Shape};
 use emberwatch_model::{Model, ModelFile};
-use std::fs::OpenOptions;
+use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Write;
 #[cfg(unix)]
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::time::{Duration, Instant, SystemTime};
 
 /// Maximum number of cached files.
 const MAX_FILES: usize = 32;
@@ -19,6 +20,26 @@ const MAX_FILES: usize = 32;
 const MAX_BYTES: usize = 4 << 20;
 
 const CHECKSUM_BYTES: usize = 4;
+
+/// Maximum time to wait for a process that makes the same belief.
+pub const LONGEST_WAIT: Duration = Duration::from_secs(300);
+
+/// Interval between two attempts to lock.
+const PAUSE: Duration = Duration::from_millis(20);
+
+/// The right to make a belief. It ends with its process.
+struct Making {
+    file: File,
+    path: PathBuf,
+}
+
+impl Drop for Making {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+        // Closing the file is not enough, because the child of a fork may have a copy of the descriptor.
+        let _ = self.file.unlock();
+    }
+}
 
 /// The cache file of one prior.
 #[derive(Debug)]
@@ -46,6 +67,51 @@ impl KeptBelief {
         let name = format!("{:08x}.belief", crc32fast::hash(key.as_bytes()));
         let path = cache_folder()?.join("emberwatch/beliefs").join(name);
         (n_value_bytes(dim) <= MAX_BYTES).then_some(Self { path, key, dim })
+    }
+
+    /// Returns the cached belief, or makes and caches it. If another process is making it, first waits until that
+    /// process ends, for at most [`LONGEST_WAIT`]; `pause` sleeps for the given time.
+    ///
+    /// # Errors
+    /// Those of `make` and `pause`.
+    pub fn read_or_make<E>(
+        &self,
+        pause: impl Fn(Duration) -> Result<(), E>,
+        make: impl FnOnce() -> Result<Belief, E>,
+    ) -> Result<Belief, E> {
+        if let Some(belief) = self.read() {
+            return Ok(belief);
+        }
+        let _making = self.lock(pause)?;
+        if let Some(belief) = self.read() {
+            return Ok(belief);
+        }
+        let belief = make()?;
+        // If the file cannot be written, a later process makes the belief again.
+        let _ = self.write(&belief);
+        Ok(belief)
+    }
+
+    /// Waits for the right to make the belief. Returns `None` if the wait was too long, or files cannot be locked here.
+    fn lock<E>(&self, pause: impl Fn(Duration) -> Result<(), E>) -> Result<Option<Making>, E> {
+        let path = self.path.with_extension("lock");
+        let mut options = OpenOptions::new();
+        options.write(true).create(true).truncate(false);
+        #[cfg(unix)]
+        options.mode(0o600);
+        let _ = path.parent().map(std::fs::create_dir_all);
+        let Ok(file) = options.open(&path) else {
+            return Ok(None);
+        };
+        let start = Instant::now();
+        while start.elapsed() < LONGEST_WAIT {
+            match file.try_lock() {
+                Ok(()) => return Ok(Some(Making { file, path })),
+                Err(TryLockError::WouldBlock) => pause(PAUSE)?,
+                Err(TryLockError::Error(_)) => break,
+            }
+        }
+        Ok(None)
     }
 
     /// Returns the cached belief, if there is a valid file.
@@ -143,6 +209,7 @@ fn remove_oldest(folder: &Path, max_files: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     #[test]
     fn only_beliefs_up_to_the_maximum_size_are_cached() {
@@ -206,6 +273,43 @@ mod tests {
             .expect_err("a folder in its place");
         let left = std::fs::read_dir(folder.path().join("new"));
         assert_eq!(left.expect("listed").count(), 1, "only the folder");
+    }
+
+    #[test]
+    fn one_makes_a_belief_and_the_others_wait() {
+        let folder = tempfile::TempDir::new().expect("a folder");
+        let kept = KeptBelief {
+            path: folder.path().join("new/a.belief"),
+            key: "key".into(),
+            dim: (3, 1, 2),
+        };
+        let belief = Belief::uniform(3, Shape::new(1, 2).expect("test shape"));
+        let n_made = AtomicUsize::new(0);
+        let pause = |time| -> Result<(), String> {
+            std::thread::sleep(time);
+            Ok(())
+        };
+        let make = || {
+            n_made.fetch_add(1, Ordering::SeqCst);
+            pause(5 * PAUSE).map(|()| belief.clone())
+        };
+        std::thread::scope(|scope| {
+            let threads = [(); 6].map(|()| scope.spawn(|| kept.read_or_make(pause, make)));
+            for thread in threads {
+                assert_eq!(thread.join().expect("no panic"), Ok(belief.clone()));
+            }
+        });
+        assert_eq!(n_made.load(Ordering::SeqCst), 1);
+        assert!(!folder.path().join("new/a.lock").exists());
+        // A process that ends leaves the right to the next one; a wait can be interrupted.
+        std::fs::remove_file(&kept.path).expect("removed");
+        let failed = kept.read_or_make(pause, || Err("no".into()));
+        assert_eq!(failed, Err("no".into()));
+        let making = kept.lock(pause).expect("free").expect("a lock");
+        let interrupted = kept.read_or_make(|_| Err("stop".into()), make);
+        assert_eq!(interrupted, Err("stop".into()));
+        drop(making);
+        assert_eq!(kept.read_or_make(pause, make), Ok(belief.clone()));
     }
 
     #[test]

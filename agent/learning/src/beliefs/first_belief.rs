@@ -20,10 +20,22 @@ pub fn first_belief(
     let Prior::Simulated { n_worlds, burn_in } = prior else {
         return prior.belief(model, shape, seed);
     };
-    let kept = KeptBelief::new(prior, model, shape, seed);
-    if let Some(belief) = kept.as_ref().and_then(KeptBelief::read) {
-        return Ok(belief);
+    let make = || {
+        announce(n_worlds, burn_in, shape);
+        prior.belief(model, shape, seed)
+    };
+    let pause = |time| {
+        std::thread::sleep(time);
+        Ok(())
+    };
+    match KeptBelief::new(prior, model, shape, seed) {
+        Some(kept) => kept.read_or_make(pause, make),
+        None => make(),
     }
+}
+
+/// Logs that a simulation begins, and how long it may take.
+fn announce(n_worlds: usize, burn_in: u64, shape: Shape) {
     let cells = n_worlds as f64 * burn_in as f64 * shape.n_cells() as f64;
     let seconds = cells / CELLS_PER_SECOND / rayon::current_num_threads() as f64;
     tracing::info!(
@@ -32,9 +44,4 @@ pub fn first_belief(
         about_seconds = seconds.ceil(),
         "simulating the first belief"
     );
-    let belief = prior.belief(model, shape, seed)?;
-    if let Some(Err(error)) = kept.map(|kept| kept.write(&belief)) {
-        tracing::debug!("the first belief was not cached: {error}");
-    }
-    Ok(belief)
 }

@@ -14,7 +14,7 @@ use super::world_form::WorldForm;
 use crate::checkpoint::{Part, check};
 use crate::parallel::in_parallel;
 use anyhow::{Context, Result, ensure};
-use emberwatch_belief::estimation::bayes::{correct, observations};
+use emberwatch_belief::estimation::bayes::{check as check_evidence, correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
 use emberwatch_belief::estimation::prediction::PredictionKind;
@@ -260,11 +260,13 @@ impl NeuralEstimator {
 
 impl Estimator for NeuralEstimator {
     /// # Errors
-    /// If the frame is impossible under the belief, or the last prediction failed.
+    /// If the frame is impossible under this belief or the filter's, or the last prediction failed. Neither belief
+    /// changes.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
-        if let Some(failure) = self.failure.take() {
-            return Err(EstimatorError::Network(failure.into()));
+        if let Some(failure) = &self.failure {
+            return Err(EstimatorError::Network(failure.clone().into()));
         }
+        check_evidence(&self.belief, &self.likelihood, frame)?;
         if let Some(filter) = &mut self.filter {
             filter.correct(frame)?;
         }

@@ -21,11 +21,13 @@ class EmberwatchError(Exception):
             needs, failed), `"bad_answer"` (client and server are of different releases),
             `"program"` (a prior or a network failed), `"pid_namespace"` (the server runs in a
             different PID namespace), `"impossible_frame"` and `"recording"`.
+        worlds: With `"impossible_frame"`, the worlds of a belief whose frames were refused.
         detail: A number that comes with a refusal. Its meaning depends on the status; 0 if there is
             no number.
     """
 
     code: str = "unknown"
+    worlds: tuple[int, ...] = ()
 
     def __init__(self, message: str | Self, code: str | None = None, detail: int = 0) -> None:
         if isinstance(message, EmberwatchError):  # `AsyncVectorEnv` wraps an error in its own type

@@ -181,6 +181,10 @@ class Belief:
     def correct(self, frames: NDArray[np.uint8], worlds: ArrayLike | slice | None = None) -> None:
         """Corrects the belief with frames (eq. 5).
 
+        Two robots over one cell in the same step read the same value. So merge the frames of a team
+        before you correct, with `numpy.minimum`, as 255 is unobserved: two corrections would count
+        one reading twice.
+
         Args:
             frames: Observed values, type uint8, 255 in unobserved cells. One frame for each world,
                 even if `worlds` selects only some.
@@ -190,7 +194,8 @@ class Belief:
             InvalidArgumentError: If the frames have another shape, type or range of values than
                 the belief expects. No belief changes.
             EmberwatchError: Code ``"impossible_frame"``, if a frame has probability 0 under the
-                belief. That world keeps its belief; the other worlds are corrected.
+                belief. That world keeps its belief; the other worlds are corrected. The error's
+                attribute `worlds` lists all refused worlds.
         """
         self._native.correct(self._frames(frames, "frame"), self._chosen(worlds))
 
