@@ -50,7 +50,7 @@ fn open_terminal() -> (File, File) {
     (terminal.into(), end.expect("open the terminal"))
 }
 
-/// A pipe without room for a single byte, and its reader, which must stay open.
+/// A full pipe, and its reader, which must stay open.
 fn full_pipe() -> (OwnedFd, OwnedFd) {
     let (reader, mut writer) = pipe().expect("a pipe");
     let size = fcntl_setpipe_size(&writer, PIPE).expect("a small pipe");

@@ -22,7 +22,15 @@ fn main() {
 fn entries(folder: &str, extension: &str, contents: impl Fn(PathBuf) -> String) -> Vec<String> {
     println!("cargo:rerun-if-changed={folder}");
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
-    let files = fs::read_dir(&folder).unwrap_or_else(|error| panic!("{folder:?}: {error}"));
+    let files = fs::read_dir(&folder).unwrap_or_else(|error| {
+        let place = folder.display();
+        // The crates share the files of `config/` through symbolic links, which `cargo package` replaces by the files.
+        println!(
+            "cargo::error={place}: expected a symbolic link to a folder, got {error}: clone with symbolic links \
+             (git clone -c core.symlinks=true; on Windows, in developer mode), not from a zip archive"
+        );
+        std::process::exit(1)
+    });
     let mut files: Vec<PathBuf> = files
         .map(|entry| entry.expect("a readable folder").path())
         .filter(|path| path.extension().unwrap_or_default() == OsStr::new(extension))

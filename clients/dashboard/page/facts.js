@@ -45,9 +45,10 @@ export function createFacts() {
       drawEmpty(picture);
     },
     recovered() { isTroubled = false; },
-    /** Shows that the dashboard itself is gone. The last picture stays visible. */
-    gone() {
-      drawTrouble("gone", "The dashboard is gone; reconnecting every second.", "dashboard gone, reconnecting");
+    /** Shows that the dashboard is gone, or refuses this browser. The last picture stays visible. */
+    gone(reason) {
+      if (reason) drawTrouble("full", `The dashboard refuses this browser: ${reason}. Trying again every second.`, reason);
+      else drawTrouble("gone", "The dashboard is gone; reconnecting every second.", "dashboard gone, reconnecting");
     },
     failed(error) {
       const problem = `This page cannot read the dashboard's picture: ${error.message}`;
@@ -69,7 +70,7 @@ function isToldLarge({ state, source, info }) {
 }
 
 function drawState(state, note) {
-  write(byId("state"), state === "gone" ? "dashboard gone, reconnecting" : state);
+  write(byId("state"), { gone: "dashboard gone, reconnecting", full: "dashboard full, reconnecting" }[state] ?? state);
   byId("state-pill").dataset.state = state;
   byId("note").hidden = !note;
   write(byId("note"), note ?? "");

@@ -43,7 +43,7 @@ const link = connect({
   ask: () => askOf(view, charts.bins()),
   show,
   superseded: (next) => next.world !== view.world,
-  up: (isUp) => { if (!isUp) facts.gone(); },
+  up: (isUp, reason) => { if (!isUp) facts.gone(reason); },
   failed,
 });
 

@@ -4,6 +4,8 @@
 import { decode } from "./wire.js";
 
 const RETRY_MILLIS = 1000;
+// The code of a dashboard that has no place for another browser (RFC 6455, registry of close codes).
+const TRY_AGAIN_LATER = 1013;
 // The dashboard answers within half a second, so a connection that is silent for this long is dead.
 const SILENCE_MILLIS = 6000;
 // One request waits for changes. A second request can be pending at the same time, so that scrubbing need not wait.
@@ -12,8 +14,8 @@ const MAX_REQUESTS = 2;
 /**
  * Keeps a connection up for as long as the page lives.
  * `ask()` returns the next request. `show(picture)` draws a picture. `superseded(picture)` returns whether to skip a
- * picture because a newer request is pending. `up(isUp)` is called when the connection is made or lost, and
- * `failed(error)` when a picture cannot be read.
+ * picture because a newer request is pending. `up(isUp, reason)` is called when the connection is made or lost; `reason`
+ * says why the dashboard refuses it. `failed(error)` is called when a picture cannot be read.
  */
 export function connect({ ask, show, superseded, up, failed }) {
   let socket = null;
@@ -29,7 +31,11 @@ export function connect({ ask, show, superseded, up, failed }) {
     socket.binaryType = "arraybuffer";
     socket.onopen = () => { asked = 0; isStale = false; up(true); send(); };
     socket.onmessage = (event) => receive(event.data);
-    socket.onclose = () => { clearTimeout(watchdog); up(false); setTimeout(open, RETRY_MILLIS); };
+    socket.onclose = (event) => {
+      clearTimeout(watchdog);
+      up(false, event.code === TRY_AGAIN_LATER ? event.reason : null);
+      setTimeout(open, RETRY_MILLIS);
+    };
   }
 
   function send() {

@@ -9,7 +9,7 @@ use crate::picture::{Ask, picture};
 use crate::scene::{Scene, Stage};
 use axum::Router;
 use axum::body::Bytes;
-use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
+use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
 use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::http::header::{
@@ -104,18 +104,34 @@ async fn only_own_pages(State(service): State<Service>, request: Request, next: 
 }
 
 async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Response {
+    let upgrade = upgrade
+        .max_message_size(MAX_ASK_BYTES)
+        .max_frame_size(MAX_ASK_BYTES);
+    // A browser tells its page nothing about a refused upgrade, so the reason is that of a closed socket.
     let Ok(place) = service.places.clone().try_acquire_owned() else {
-        let problem = format!("expected at most {MAX_BROWSERS} browsers at a time");
-        return (StatusCode::SERVICE_UNAVAILABLE, problem).into_response();
+        return upgrade.on_upgrade(close_full);
     };
     let stage = service.stage;
-    upgrade
-        .max_message_size(MAX_ASK_BYTES)
-        .max_frame_size(MAX_ASK_BYTES)
-        .on_upgrade(async move |socket| {
-            answer(socket, &stage).await;
-            drop(place);
-        })
+    upgrade.on_upgrade(async move |socket| {
+        answer(socket, &stage).await;
+        drop(place);
+    })
+}
+
+/// Closes the socket of a browser for which there is no place.
+async fn close_full(mut socket: WebSocket) {
+    let reason = format!("expected at most {MAX_BROWSERS} browsers at a time: close one");
+    let frame = CloseFrame {
+        code: close_code::AGAIN,
+        reason: reason.into(),
+    };
+    // The socket ends when the browser has answered, or does not.
+    if send(&mut socket, Message::Close(Some(frame)))
+        .await
+        .is_some()
+    {
+        let _ = timeout(SILENCE, socket.recv()).await;
+    }
 }
 
 /// Answers each request with one picture, until the browser leaves or sends an invalid message.

@@ -31,6 +31,22 @@ def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
     assert not look.at("panel-truth").is_visible()
 
 
+def test_a_browser_beyond_the_limit_is_told_so_until_another_leaves(watched, open_page):
+    """The dashboard serves 32 browsers: this page, and 31 more sockets."""
+    many = """() => Promise.all(Array.from({ length: 31 }, () => new Promise((opened) => {
+        const socket = new WebSocket(new URL("socket", location.href));
+        socket.onopen = () => opened();
+        (window.sockets ??= []).push(socket);
+    })))"""
+    look = watched.look
+    look.page.evaluate(many)
+    late = open_page(watched.dashboard)
+    late.eventually(lambda: "dashboard full" in late.text("state"), "full")
+    assert "at most 32 browsers at a time: close one" in late.at("note").text_content()
+    look.page.evaluate("() => window.sockets.pop().close()")
+    late.eventually(lambda: late.text("state") == "serving", "a place")
+
+
 def settled_serial(look) -> int:
     """Waits until the page and its slider show the same entry. Returns its serial number."""
     look.eventually(

@@ -120,11 +120,7 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
                 ("instance", expected, format!("'{}'", shortened(&name))),
             )
         }
-        ChannelError::NoServer { instance } => {
-            let remedy = format!("start one with `emberwatch-server --instance {instance}`");
-            let text = format!("no server on instance '{instance}': {remedy}");
-            error(py, "NoServerError", (text,))
-        }
+        ChannelError::NoServer { .. } => error(py, "NoServerError", (text.replace('"', "'"),)),
         ChannelError::OtherVersion { version } => {
             error(py, "EmberwatchError", (text, "version_mismatch", version))
         }

@@ -39,11 +39,14 @@ pub enum ChannelError {
     },
     /// No server runs on the instance.
     #[error(
-        "no server on instance {instance:?}: start one with `emberwatch-server --instance {instance}`"
+        "no server on instance {instance:?}: start one with `emberwatch-server --instance {instance}`{}",
+        .others.as_ref().map(|others| format!("; {others}")).unwrap_or_default()
     )]
     NoServer {
         /// Name of the instance.
         instance: String,
+        /// A hint at servers of other users, which cannot be reached.
+        others: Option<String>,
     },
     /// The operating system does not support channels.
     #[error(

@@ -25,13 +25,6 @@ impl Instance {
         &self.0
     }
 
-    /// Returns the error for an instance without a server.
-    pub fn no_server(&self) -> ChannelError {
-        ChannelError::NoServer {
-            instance: self.0.clone(),
-        }
-    }
-
     /// Returns the error for an instance whose server is in another PID namespace.
     pub fn elsewhere(&self) -> ChannelError {
         ChannelError::OtherPidNamespace {

@@ -4,6 +4,7 @@
 //! that users never collide and no stray configuration file is read.
 
 use super::channel_files::other_version;
+use super::directory::no_server;
 use emberwatch_messages::message::{
     AgentHeader, ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest,
     TruthHeader,
@@ -118,7 +119,7 @@ pub fn service_name(instance: &Instance, channel: Channel) -> ServiceName {
 fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
     match other_version(instance.name(), channel.name()) {
         Some(version) => ChannelError::OtherVersion { version },
-        None => instance.no_server(),
+        None => no_server(instance),
     }
 }
 
@@ -282,7 +283,7 @@ impl Services<'_> {
         if service.dynamic_config().number_of_servers() > 0 {
             Ok(service)
         } else {
-            Err(self.instance.no_server())
+            Err(no_server(self.instance))
         }
     }
 

@@ -3,10 +3,12 @@
 use super::ipc::Ipc;
 use super::resources::{CLIENT_DESCRIPTORS, REMEDY, ipc_error, no_descriptors};
 use emberwatch_messages::errors::ChannelError;
+use emberwatch_messages::instance::Instance;
 use iceoryx2::node::Node;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 use rustix::io::Errno;
 use std::cell::Cell;
+use std::collections::BTreeSet;
 use std::fs::{DirBuilder, Permissions};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::PathBuf;
@@ -124,6 +126,35 @@ pub(crate) fn prefix() -> String {
     format!("emberwatch-{}_", rustix::process::getuid().as_raw())
 }
 
+/// Returns the error for an instance without a server. If other users have channels here, a hint names them, as their
+/// servers cannot be reached.
+pub(super) fn no_server(instance: &Instance) -> ChannelError {
+    ChannelError::NoServer {
+        instance: instance.name().into(),
+        others: others(SHARED_MEMORY.as_ref(), rustix::process::getuid().as_raw()),
+    }
+}
+
+/// Returns a sentence about the users other than `own` whose shared memory is in a folder.
+fn others(folder: &std::path::Path, own: u32) -> Option<String> {
+    let of = |name: &str| -> Option<u32> {
+        let (user, _) = name.strip_prefix("emberwatch-")?.split_once('_')?;
+        user.parse().ok()
+    };
+    let entries = std::fs::read_dir(folder).ok()?;
+    let names = entries.flatten().map(|entry| entry.file_name());
+    let users = names.filter_map(|name| of(name.to_str()?));
+    let users: BTreeSet<u32> = users.filter(|&user| user != own).collect();
+    let users: Vec<String> = users.iter().map(u32::to_string).collect();
+    let sentence = || {
+        let users = users.join(", ");
+        format!(
+            "programs of user {users} run here, too, but a program of user {own} reaches only servers of user {own}"
+        )
+    };
+    (!users.is_empty()).then(sentence)
+}
+
 /// Returns the error for a file or folder that the system does not allow this process to use.
 pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> ChannelError {
     if error.raw_os_error() == Some(Errno::MFILE.raw_os_error()) {
@@ -180,6 +211,33 @@ fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn other_users_with_channels_are_named() {
+        let folder = std::env::temp_dir().join(format!("emberwatch-users-{}", std::process::id()));
+        std::fs::create_dir(&folder).expect("a new directory");
+        let add = |name: &str| std::fs::write(folder.join(name), "").expect("a file");
+        // A user's directory stays after the last program; other files are of other programs.
+        for name in [
+            "emberwatch-7",
+            "emberwatch-3_1.data",
+            "emberwatch-x_1",
+            "other-5_1",
+        ] {
+            add(name);
+        }
+        assert_eq!(others(&folder, 3), None);
+        for name in ["emberwatch-1000_2.data", "emberwatch-5_7", "emberwatch-5_8"] {
+            add(name);
+        }
+        let hint = others(&folder, 3).expect("two users");
+        assert!(
+            hint.contains("user 5, 1000 run here") && hint.contains("of user 3 reaches"),
+            "{hint}"
+        );
+        assert_eq!(others(&folder.join("none"), 3), None);
+        std::fs::remove_dir_all(&folder).expect("clean up");
+    }
 
     #[test]
     fn a_directory_writable_by_others_is_refused() {

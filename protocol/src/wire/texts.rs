@@ -5,6 +5,7 @@ use super::channels::{
     Channel, ChannelError, ControlService, Instance, Ipc, Services, ipc_error, limited_error,
     server_node,
 };
+use super::directory::no_server;
 use super::exchange::{Exchange, RequestClient, copied};
 use super::process::{WatchedProcess, node_pid, watch_error};
 use super::resources::check_room_for_ports;
@@ -136,11 +137,11 @@ fn server_process(
     service: &ControlService,
     instance: &Instance,
 ) -> Result<WatchedProcess, ChannelError> {
-    let node = server_node(service).ok_or_else(|| instance.no_server())?;
+    let node = server_node(service).ok_or_else(|| no_server(instance))?;
     match WatchedProcess::open(node_pid(node)) {
         Ok(process) if !process.has_ended() => Ok(process),
         Ok(_) | Err(Errno::SRCH) if lives_elsewhere(node) => Err(instance.elsewhere()),
-        Ok(_) | Err(Errno::SRCH) => Err(instance.no_server()),
+        Ok(_) | Err(Errno::SRCH) => Err(no_server(instance)),
         Err(errno) => Err(watch_error(errno)),
     }
 }

@@ -316,8 +316,8 @@ mod tests {
     fn the_oldest_files_are_removed() {
         let folder = tempfile::TempDir::new().expect("a folder");
         for (name, seconds) in [("a", 20), ("b", 10), ("c", 30)] {
-            let file = std::fs::File::create(folder.path().join(name)).expect("a file");
-            let changed = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(seconds);
+            let file = File::create(folder.path().join(name)).expect("a file");
+            let changed = SystemTime::UNIX_EPOCH + Duration::from_secs(seconds);
             file.set_modified(changed).expect("a time");
         }
         remove_oldest(folder.path(), 2);

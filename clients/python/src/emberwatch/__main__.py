@@ -10,7 +10,7 @@ commands, each with --help:
   python -m emberwatch.render.film   makes films of recordings
   python -m emberwatch.landscape     makes recorded worlds from rasters of fires
 
-programs in separate packages (pip install "emberwatch[programs]"):
+programs in separate packages (pip install --find-links FOLDER "emberwatch[programs]"):
   emberwatch-server                  simulates worlds that several processes share
   emberwatch-agent                   explores worlds, trains policies, compares them
   emberwatch-dashboard               shows an instance or a recording in a browser
