@@ -20,6 +20,7 @@ use emberwatch_learning::options::{Crew, usual};
 use emberwatch_model::{Description, Model};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
+use pyo3::pybacked::PyBackedBytes;
 use std::sync::OnceLock;
 
 /// The features and the paths of plans.
@@ -76,15 +77,15 @@ pub struct Options {
 #[pymethods]
 impl Options {
     /// Checks all arguments. Beliefs exist only after [`Self::begin`]. `checkpoint` is a path, for errors, and the bytes
-    /// of its file. `watched` is the instance in which beliefs are
-    /// published, and the number that the first of these worlds has in that instance.
+    /// of its file. `watched` is the instance in which beliefs are published, and the number that the first of these
+    /// worlds has in that instance.
     #[new]
     fn new(
         py: Python<'_>,
         spec: Spec<'_>,
         n_worlds: usize,
         estimator: Option<&str>,
-        checkpoint: Option<(String, Vec<u8>)>,
+        checkpoint: Option<(String, PyBackedBytes)>,
         prior: &str,
         watched: Option<(String, u32)>,
     ) -> PyResult<Self> {
