@@ -89,7 +89,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         else:
             drawn = draw_seed(self.np_random) if seed is None else seed
             answer = self._session.reset([0], [drawn])
-        told = None if processed is None else processed.results.tobytes()
+        told = processed.results.tobytes() if resumes and processed is not None else None
         continues = answer.results.tobytes() == told
         if not continues:
             self._path, self._n_missed = None, 0
