@@ -2,7 +2,9 @@
 
 use emberwatch_learning::policy;
 use std::time::{Duration, Instant};
-use tests::harness::{AGENT, Ended, Folder, Program, SERVER, SMALL, Server, new_instance, run};
+use tests::harness::{
+    AGENT, Ended, Folder, LIMIT, Program, SERVER, SMALL, Server, new_instance, run,
+};
 
 /// Flags of a very short comparison that starts its own server.
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
@@ -196,5 +198,29 @@ fn an_agent_acts_as_slowly_as_it_is_told() {
 fn help_lists_the_policies() {
     for command in ["run", "compare"] {
         run(AGENT, &format!("{command} --help")).check_prints(policy::help().trim_end());
+    }
+}
+
+#[test]
+fn refusals_quote_little_of_a_long_value() {
+    let long = "x".repeat(3000);
+    for (program, arguments) in [
+        (SERVER, format!("--task {long}")),
+        (SERVER, format!("--instance {long}")),
+        (SERVER, format!("--height {long}")),
+        (SERVER, format!("--{long}")),
+        (SERVER, long.clone()),
+        (AGENT, format!("compare --policies {long}")),
+        (AGENT, format!("compare --task {long}")),
+        (AGENT, format!("train --out out --learner {long}")),
+        ("emberwatch-dashboard", format!("--listen {long}")),
+    ] {
+        let ended = Program::start(program, &arguments).wait(LIMIT);
+        assert_ne!(ended.code, Some(0), "{program}");
+        let text = ended.stderr;
+        assert!(
+            text.len() < 1500 && !text.contains(&"x".repeat(81)),
+            "{text}"
+        );
     }
 }

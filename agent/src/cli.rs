@@ -5,7 +5,7 @@ use crate::process::set_up_process;
 use clap::{Parser, Subcommand};
 use emberwatch_learning::policy;
 use emberwatch_protocol::limits::threads::NoThreads;
-use emberwatch_protocol::program::start_logging;
+use emberwatch_protocol::program::{parse_flags, start_logging};
 use rayon::ThreadPoolBuilder;
 use std::process::ExitCode;
 
@@ -37,7 +37,7 @@ enum Command {
 /// Parses the arguments, runs the subcommand, and returns the exit code.
 pub fn main() -> ExitCode {
     set_up_process();
-    let command = Cli::parse().command;
+    let command = parse_flags::<Cli>().command;
     let _log = start_logging();
     if let Err(error) = start_threads() {
         tracing::error!("{error}");

@@ -4,7 +4,7 @@ mod commands;
 
 use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
-use emberwatch_protocol::program::{print, start_logging, stop_on_signals};
+use emberwatch_protocol::program::{parse_flags, print, start_logging, stop_on_signals};
 use emberwatch_server::flags::ServerFlags;
 use emberwatch_server::server::{announce_reach, serve};
 use std::process::ExitCode;
@@ -46,7 +46,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli: Cli = parse_flags();
     let _log = start_logging();
     match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,

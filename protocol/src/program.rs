@@ -1,6 +1,10 @@
-//! Code of every program: printing, and stopping on signals or when another process ends.
+//! Code of every program: flags, printing, and stopping on signals or when another process ends.
 
+use clap::Parser;
+use clap::error::ContextKind::{InvalidArg, InvalidSubcommand, InvalidValue};
+use clap::error::ContextValue;
 use emberwatch_messages::limits::threads::spawn;
+use emberwatch_model::text::shortened;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::exit;
@@ -15,6 +19,19 @@ pub use emberwatch_messages::process::pid_namespace;
 pub use emberwatch_model::text::{MAX_TEXT_BYTES, read_text};
 
 const SAME_SIGNAL: Duration = Duration::from_millis(500);
+
+/// Parses the program's flags. An error, which ends the program, quotes at most 80 characters of a value.
+pub fn parse_flags<T: Parser>() -> T {
+    T::try_parse().unwrap_or_else(|mut error| {
+        for kind in [InvalidValue, InvalidArg, InvalidSubcommand] {
+            if let Some(ContextValue::String(given)) = error.get(kind) {
+                let quoted = shortened(given).into_owned();
+                error.insert(kind, ContextValue::String(quoted));
+            }
+        }
+        error.exit()
+    })
+}
 
 /// Prints a text to standard output. A reader that has closed its end, as `head` does, is no error: it needs no more.
 ///

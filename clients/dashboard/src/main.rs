@@ -5,7 +5,9 @@ use clap::Parser;
 use emberwatch_dashboard::scene::{Scene, Stage};
 use emberwatch_dashboard::{access, player, server, watcher};
 use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::program::{WatchedProcess, print, start_logging, stop_on_signals};
+use emberwatch_protocol::program::{
+    WatchedProcess, parse_flags, print, start_logging, stop_on_signals,
+};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -50,7 +52,7 @@ struct Cli {
 }
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli: Cli = parse_flags();
     let _log = start_logging();
     match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
