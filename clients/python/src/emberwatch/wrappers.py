@@ -53,8 +53,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     ## Priors
     - ``"simulated"``: how often each cell is in each state after the burn-in of 64 simulated
-      worlds. The simulation takes some seconds; later calls read its result from
-      ``~/.cache/emberwatch``.
+      worlds. The simulation takes some seconds; other processes that need it wait, and later calls
+      read its result from ``~/.cache/emberwatch``.
     - ``"initial"``: the model's initial distribution, which is exact for worlds without burn-in.
     - ``"uniform"``: every state equally likely.
     - An array of shape (S, H, W), in which the numbers of each cell sum to 1.
