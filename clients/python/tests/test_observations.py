@@ -22,6 +22,7 @@ from environments import (
 from failures import refuses
 
 from emberwatch.belief import Transition, entropy
+from emberwatch.envs.observations import Observations
 from emberwatch.wrappers import BeliefObservation
 
 #: The smallest grid that the parts are meant for.
@@ -130,6 +131,25 @@ def test_a_joined_episode_continues_from_the_recalled_frames(of: str) -> None:
         second = maker(instance=instance, observation=parts)
         joined, _ = second.reset(options={"resume": True})
         assert_same(joined, last)
+
+
+def test_rows_of_different_steps_join_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(model=LIVELY, worlds=3) as instance:
+        first = make_vec(3, instance=instance, observation=OF_PATHS)
+        rollout(first, 7, seed=4)
+        first.reset(options={"reset_mask": np.array([False, True, False])})
+        last = first.step(actions(first, 1)[0])[0]
+        first.close()
+        update, updates = Observations.update, list[Any]()
+        monkeypatch.setattr(
+            Observations,
+            "update",
+            lambda self, moved, frames: (updates.append(moved), update(self, moved, frames)),
+        )
+        second = make_vec(3, instance=instance, observation=OF_PATHS)
+        assert_same(second.reset(options={"resume": True})[0], last)
+        # One update for each step after the first, not for each step of each row.
+        assert np.array(updates).sum(axis=0).tolist() == [8, 1, 8] and len(updates) == 8
 
 
 @pytest.mark.parametrize("of", JOINED)

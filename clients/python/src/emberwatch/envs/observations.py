@@ -1,6 +1,7 @@
 """Observations of learners: their parts, and the space of each part."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import zip_longest
 from typing import Any, Final, Literal, TypeAlias, cast
 
 import numpy as np
@@ -100,13 +101,23 @@ class Observations:
         steps = results["world"]["step"]
         joined = begun & (steps > 0) & (not self._has_no_memory)
         self._reset(begun & ~joined, frames)
-        for row in np.flatnonzero(joined).tolist():
-            show, one, seen = self._reset, np.arange(self._n_rows) == row, np.zeros_like(frames)
-            for past in self._session.history(row, int(steps[row])):
-                seen[row] = past.frames[0]
-                show(one, seen)
-                show = self.update
-            show(one, frames)
+        rows = np.flatnonzero(joined).tolist()
+        each = [self._until(int(steps[row]), row, frames) for row in rows]
+        show, seen = self._reset, np.zeros_like(frames)
+        # The rows join together, because each update takes the time of all rows.
+        for shown in zip_longest(*each):
+            moved = np.zeros(self._n_rows, np.bool_)
+            for row, frame in zip(rows, shown, strict=True):
+                if frame is not None:
+                    seen[row], moved[row] = frame, True
+            show(moved, seen)
+            show = self.update
+
+    def _until(self, step: int, row: int, frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
+        """Yields the frames of a row that are still kept, then its frame of the step."""
+        for past in self._session.history(row, step):
+            yield past.frames[0]
+        yield frames[row]
 
     def _reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
         """Forgets everything in the rows `begun`, then shows their frames, (n_rows, H, W)."""
