@@ -190,16 +190,15 @@ impl Part<'_> {
 /// # Errors
 /// If the system reports an error. An existing file then remains unchanged.
 pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
-    let of_file = || format!("checkpoint {}", path.display());
-    let bytes = encode(kind, contents).with_context(of_file)?;
+    let bytes = encode(kind, contents).with_context(|| named(path))?;
     // Only the owner may read the file, because it contains beliefs about worlds.
-    replace_file(path, &bytes, Readers::Owner).with_context(of_file)
+    replace_file(path, &bytes, Readers::Owner).with_context(|| named(path))
 }
 
 /// Reads a checkpoint. Returns its kind and its contents.
 pub fn read(path: &Path) -> Result<(String, Contents)> {
     let contents = decode(&read_bytes(path)?);
-    contents.with_context(|| format!("checkpoint {}", path.display()))
+    contents.with_context(|| named(path))
 }
 
 /// Reads the bytes of a checkpoint, for [`decode`].
@@ -215,7 +214,12 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>> {
         File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
         Ok(bytes)
     };
-    bytes().with_context(|| format!("checkpoint {}", path.display()))
+    bytes().with_context(|| named(path))
+}
+
+/// Names a checkpoint in errors.
+pub fn named(path: &Path) -> String {
+    format!("checkpoint {}", shortened(&path.display().to_string()))
 }
 
 /// Encodes a checkpoint for a kind of learner.

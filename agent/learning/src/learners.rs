@@ -53,7 +53,7 @@ pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>, device: &Device) -> R
     for path in paths {
         let (kind, contents) = checkpoint::read(path)?;
         let added = add(&mut learned, &kind, &contents, device);
-        added.with_context(|| format!("checkpoint {}", path.display()))?;
+        added.with_context(|| checkpoint::named(path))?;
     }
     Ok(learned)
 }

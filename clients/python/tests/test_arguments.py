@@ -26,7 +26,7 @@ from gymnasium.vector import AutoresetMode
 
 import emberwatch
 from emberwatch import belief
-from emberwatch.benchmark import evaluate
+from emberwatch.benchmark import evaluate, suite
 from emberwatch.model import Model
 from emberwatch.wrappers import BeliefObservation
 
@@ -253,6 +253,14 @@ GIVEN_LONG: dict[str, Callable[[Any], object]] = {
     "kind": lambda long: belief.load("no", height=4, width=4, kind=long),
     "policy": lambda long: evaluate(lambda seen: seen, name="mine", env=long),
     "baseline": lambda long: make(OBJECTIVE, estimator=long),
+    "state": lambda long: Model.named(Path(LIVELY).read_text().replace('"latent"', f'"{long}"', 1)),
+    "checkpoint": lambda long: make(OBJECTIVE, checkpoint=long),
+    "prior": lambda long: BeliefObservation(make(), prior=long, checkpoint="no"),
+    "csv": lambda long: evaluate(
+        lambda seen: seen, name="a", csv=long, seeds=[1], steps=1, model=LIVELY, burn_in=0
+    ),
+    "tasks": lambda long: suite(lambda seen: seen, name="a", folder="no", tasks=["small"] * 900),
+    "policies": lambda long: suite({long: 1}, name="a", folder="no", tasks=["small"]),
 }
 
 

@@ -6,6 +6,7 @@ use super::file::{
     StateEntry, parse_color,
 };
 use super::grid::Grid;
+use crate::text::shortened;
 use ndarray::{Array1, Array2, Array4};
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
@@ -331,7 +332,10 @@ impl Checker<'_> {
         let names: Vec<&str> = file.states.iter().map(|it| it.name.as_str()).collect();
         let state = names.iter().position(|known| known == name);
         if state.is_none() {
-            let expected = format!("the name of a state, one of {names:?}");
+            let expected = format!(
+                "the name of a state, one of {}",
+                shortened(&format!("{names:?}"))
+            );
             return self.wrong("edge".into(), &expected, format!("{name:?}"));
         }
         Ok(state)

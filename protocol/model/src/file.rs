@@ -172,9 +172,10 @@ pub enum ModelError {
     },
     /// A kernel entry names an unknown state.
     #[error(
-        "model {:?}: kernel entry names state {:?}, expected one of {known:?}",
+        "model {:?}: kernel entry names state {:?}, expected one of {}",
         shortened(model),
-        shortened(name)
+        shortened(name),
+        shortened(&format!("{known:?}"))
     )]
     UnknownState {
         /// The model's name.
@@ -186,8 +187,9 @@ pub enum ModelError {
     },
     /// An entry has a wrong value.
     #[error(
-        "model {:?}: {what}: expected {expected}, got {}",
+        "model {:?}: {}: expected {expected}, got {}",
         shortened(model),
+        shortened(what),
         shortened(got)
     )]
     Value {

@@ -105,7 +105,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             first = prior_of(prior, known_model, **grid, burn_in=burn_in)
             self._belief = known(known_model, prior=first, kind="known" if kind is None else kind)
         elif prior is not None:
-            raise invalid("prior", "None with a checkpoint, which has its own prior", prior)
+            raise invalid(
+                "prior", "None with a checkpoint, which has its own prior", repr_of(prior)
+            )
         else:
             is_hidden = model is None and getattr(env.unwrapped, "model", None) is None
             found = None if is_hidden else _model_of(env, model)

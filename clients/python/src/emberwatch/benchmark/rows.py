@@ -13,7 +13,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from emberwatch.common.paths import utf8
-from emberwatch.errors import ExistingFileError, InvalidArgumentError, invalid, repr_of
+from emberwatch.errors import (
+    ExistingFileError,
+    InvalidArgumentError,
+    invalid,
+    repr_of,
+    shortened,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,7 +211,8 @@ def _temporary(path: Path) -> Generator[Path]:
         temporary.touch()
         yield temporary
     except OSError as error:
-        raise invalid("csv", "a file that can be written", f"{path}: {error}") from None
+        got = f"{shortened(str(path))}: {error.strerror or error}"
+        raise invalid("csv", "a file that can be written", got) from None
     finally:
         with suppress(OSError):
             temporary.unlink()

@@ -13,7 +13,7 @@ from emberwatch.benchmark.policies import Policy
 from emberwatch.benchmark.rows import Row, check_writable
 from emberwatch.common.arguments import as_count
 from emberwatch.common.paths import absolute
-from emberwatch.errors import ExistingFileError, invalid, repr_of
+from emberwatch.errors import ExistingFileError, invalid, repr_of, shortened
 from emberwatch.model.tasks import Task, built_in_tasks
 
 
@@ -52,11 +52,11 @@ def suite(
     chosen = [(absolute(source), Task.named(source)) for source in sources]
     names = [task.name for _, task in chosen]
     if len(set(names)) < len(names):
-        raise invalid("tasks", "tasks with different names", ", ".join(names))
+        raise invalid("tasks", "tasks with different names", shortened(", ".join(names)))
     files: dict[str, Path] = {}
     for task in names:
         if policies is not None and task not in policies:
-            raise invalid("policy", f"one for the task {task}", ", ".join(policies))
+            raise invalid("policy", f"one for the task {task}", shortened(", ".join(policies)))
         files[task] = Path(os.path.abspath(folder), task, re.sub("[/+]", "_", name) + ".csv")
         if os.path.lexists(files[task]):
             raise ExistingFileError(
