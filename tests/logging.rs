@@ -23,6 +23,11 @@ const PIPE: usize = 4096;
 /// Number of refused requests whose log exceeds what the server keeps for a reader that pauses.
 const N_REFUSED: usize = 14_000;
 
+/// The flag of a server or dashboard that must not outlive a failed test.
+fn ends_with_us() -> String {
+    format!("--exit-with {}", std::process::id())
+}
+
 fn start(name: &str, arguments: &str, stdout: Stdio, stderr: impl Into<Stdio>) -> Child {
     let mut command = Command::new(program_path(name));
     command
@@ -97,11 +102,15 @@ fn an_unread_log_stops_no_program() {
         let (_reader, log) = unread();
         let stderr = || log.try_clone().expect("a file descriptor");
         let instance = new_instance();
-        let flags = format!("--instance {} {SMALL}", instance.name());
+        let flags = format!("--instance {} {SMALL} {}", instance.name(), ends_with_us());
         let server = start(SERVER, &flags, Stdio::null(), stderr());
         let mut connection = connect(&instance);
 
-        let flags = format!("--instance {} --listen 127.0.0.1:0", instance.name());
+        let flags = format!(
+            "--instance {} --listen 127.0.0.1:0 {}",
+            instance.name(),
+            ends_with_us()
+        );
         let mut dashboard = start("emberwatch-dashboard", &flags, Stdio::piped(), stderr());
         let mut url = String::new();
         let out = dashboard.stdout.take().expect("piped");
@@ -126,7 +135,7 @@ fn dropped_lines_are_counted_and_reported() {
     let size = fcntl_setpipe_size(&writer, PIPE).expect("a small pipe");
     writer.write_all(&vec![b'\n'; size]).expect("fill the pipe");
     let instance = new_instance();
-    let flags = format!("--instance {} {SMALL}", instance.name());
+    let flags = format!("--instance {} {SMALL} {}", instance.name(), ends_with_us());
     let server = start(SERVER, &flags, Stdio::null(), writer);
     let mut connection = connect(&instance);
     for _ in 0..N_REFUSED {
@@ -194,30 +203,29 @@ fn colours_follow_the_terminal_and_the_environment() {
 
 #[test]
 fn unusable_levels_are_named_once_and_the_default_holds() {
-    for (level, n_warnings) in [
-        (None, 0),
-        (Some(""), 0),
-        (Some(" , "), 0),
-        (Some("emberwatch"), 0),
-        (Some("warn,emberwatch_server=info,tokio=warn"), 0),
-        (Some("inof"), 1),
-        (Some("info,emberwatch-server=debug"), 1),
-        (Some("emberwatch_sever=info"), 1),
-        (Some("info=info=info"), 1),
+    // The level, the number of warnings about it, and whether the default level holds.
+    for (level, n_warnings, is_default) in [
+        (None, 0, true),
+        (Some(""), 0, true),
+        (Some(" , "), 0, true),
+        (Some("emberwatch"), 0, true),
+        (Some("warn,emberwatch_sim=info,tokio=warn"), 0, false),
+        (Some("inof"), 1, true),
+        (Some("info,emberwatch-server=debug"), 1, true),
+        (Some("emberwatch_sever=info"), 1, true),
+        (Some("info=info=info"), 1, true),
     ] {
-        let mut command = Command::new(program_path(SERVER));
-        command.args(["status", "--instance", "nobody"]);
+        let mut command = Command::new(program_path(AGENT));
+        command.args(["run", "--instance", "nobody", "--wait", "0.1"]);
         command
             .env_remove("RUST_LOG")
             .envs(level.map(|level| ("RUST_LOG", level)));
-        let log = command.output().expect("run the server").stderr;
+        let log = command.output().expect("run the agent").stderr;
         let log = String::from_utf8(log).expect("text");
-        assert_eq!(
-            log.matches("RUST_LOG: expected").count(),
-            n_warnings,
-            "{level:?}: {log}"
-        );
-        assert_eq!(log.matches("ERROR").count(), 1, "{level:?}: {log}");
+        let count = |words| log.matches(words).count();
+        assert_eq!(count("RUST_LOG: expected"), n_warnings, "{level:?}: {log}");
+        assert_eq!(count("ERROR"), 1, "{level:?}: {log}");
+        assert_eq!(count(" INFO ") > 0, is_default, "{level:?}: {log}");
     }
 }
 

@@ -175,13 +175,16 @@ impl Estimators {
                     if keeps_correlations {
                         keep_correlations(&**world, &mut *new);
                     }
-                    *world = new;
-                    Ok(())
+                    Ok((world, new))
                 })
             })
         });
-        let reset: anyhow::Result<()> = reset.into_iter().collect();
-        reset.map_err(|error| raise(py, &error))
+        // Either all worlds are reset, or none.
+        let reset: anyhow::Result<Vec<_>> = reset.into_iter().collect();
+        for (world, new) in reset.map_err(|error| raise(py, &error))? {
+            *world = new;
+        }
+        Ok(())
     }
 
     /// Corrects the beliefs about the chosen worlds with their frames. `frames`, `[n, H, W]`, has one frame per world.

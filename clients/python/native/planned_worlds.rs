@@ -97,17 +97,17 @@ impl PlannedWorlds {
         prior: &Belief,
     ) -> Result<()> {
         let seeds: Vec<(usize, u64)> = seeds.collect();
+        let worlds: Vec<usize> = seeds.iter().map(|&(world, _)| world).collect();
+        self.rows(&worlds)?;
         let Self { crew, threads, .. } = self;
         let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?));
         let n_worlds = seeds.len();
         let begun = threads.work(is_short(crew, n_worlds), |threads| {
             threads.each(seeds, begin)
         });
-        for begun in begun {
-            let (world, planned) = begun?;
-            let n_worlds = self.worlds.len();
-            let place = self.worlds.get_mut(world);
-            *place.with_context(|| no_such_world(n_worlds, world))? = Some(planned);
+        // Either all episodes begin, or none.
+        for (world, planned) in begun.into_iter().collect::<Result<Vec<_>>>()? {
+            self.worlds[world] = Some(planned);
         }
         Ok(())
     }

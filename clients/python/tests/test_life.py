@@ -1,7 +1,11 @@
 """The life cycle of environments: closing, copying, and servers that fail."""
 
 import copy
+import os
 import pickle
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -122,3 +126,17 @@ def test_copying_an_open_environment_is_refused(making: Make) -> None:
     again = pickle.loads(pickle.dumps(copy.deepcopy(env)))
     assert_same(rollout(again, 3, seed=1), expected)
     again.close()
+
+
+@pytest.mark.parametrize("module", ["emberwatch", "emberwatch.landscape", "emberwatch.render.film"])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_leaves_ends_a_command_silently(module: str, unbuffered: str) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", module, "--help"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    ended = subprocess.run(
+        command, stdout=writer, stderr=subprocess.PIPE, env=environment, timeout=60
+    )
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGPIPE, b"")

@@ -1,11 +1,13 @@
 """Simulated priors: cached, and safe with signals and forks."""
 
+import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from processes import script
+from processes import eventually, script
 
 from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Model
@@ -37,3 +39,26 @@ def test_ctrl_c_ends_the_simulation() -> None:
     process.signal(signal.SIGINT)
     code, _, error = process.end()
     assert code in (1, 130, -signal.SIGINT) and "KeyboardInterrupt" in error
+
+
+def test_the_next_process_simulates_if_one_is_killed_and_ctrl_c_ends_the_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = script(ENDLESS)
+    assert first.line() == "begun"
+    assert eventually(lambda: list(tmp_path.rglob("*.lock")))
+    waits, next_one = script(ENDLESS), script(ENDLESS)
+    assert [waits.line(), next_one.line()] == ["begun", "begun"]
+    waits.signal(signal.SIGINT)
+    code, _, error = waits.end()
+    assert code in (1, 130, -signal.SIGINT) and "KeyboardInterrupt" in error
+    before = cpu_seconds(next_one.pid)
+    first.signal(signal.SIGKILL)
+    assert eventually(lambda: cpu_seconds(next_one.pid) > before + 0.5)
+
+
+def cpu_seconds(pid: int) -> float:
+    """Returns the processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

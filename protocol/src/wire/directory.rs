@@ -138,7 +138,9 @@ pub(super) fn no_server(instance: &Instance) -> ChannelError {
 /// Returns a sentence about the users other than `own` whose shared memory is in a folder.
 fn others(folder: &std::path::Path, own: u32) -> Option<String> {
     let of = |name: &str| -> Option<u32> {
-        let (user, _) = name.strip_prefix("emberwatch-")?.split_once('_')?;
+        // Other files stay after a user's last program.
+        let name = name.strip_prefix("emberwatch-")?.strip_suffix(".dynamic")?;
+        let (user, _) = name.split_once('_')?;
         user.parse().ok()
     };
     let entries = std::fs::read_dir(folder).ok()?;
@@ -220,14 +222,19 @@ mod tests {
         // A user's directory stays after the last program; other files are of other programs.
         for name in [
             "emberwatch-7",
-            "emberwatch-3_1.data",
+            "emberwatch-9_node.0_10_0.global_mgmt",
+            "emberwatch-3_1.dynamic",
             "emberwatch-x_1",
             "other-5_1",
         ] {
             add(name);
         }
         assert_eq!(others(&folder, 3), None);
-        for name in ["emberwatch-1000_2.data", "emberwatch-5_7", "emberwatch-5_8"] {
+        for name in [
+            "emberwatch-1000_2.dynamic",
+            "emberwatch-5_7.dynamic",
+            "emberwatch-5_8.dynamic",
+        ] {
             add(name);
         }
         let hint = others(&folder, 3).expect("two users");

@@ -255,13 +255,14 @@ impl NeuralEstimator {
             states_from_observations(&mut observations, inverse);
         }
         self.belief = belief(observations);
+        self.failure = None;
     }
 }
 
 impl Estimator for NeuralEstimator {
     /// # Errors
     /// If the frame is impossible under this belief or the filter's, or the last prediction failed. Neither belief
-    /// changes.
+    /// changes; after a failure, all frames are refused until a prediction succeeds.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         if let Some(failure) = &self.failure {
             return Err(EstimatorError::Network(failure.clone().into()));

@@ -4,6 +4,7 @@ import argparse
 from typing import Final
 
 from emberwatch._native import VERSION
+from emberwatch.common.output import end_with_reader
 
 _COMMANDS: Final = """
 commands, each with --help:
@@ -30,4 +31,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    end_with_reader()
     main()

@@ -83,7 +83,8 @@ class WildfireMovesEnv(WorldEnv):
     ## Episode End
 
     Never `terminated`. `truncated` after `max_episode_steps` moves (default 64,000, which is 1,000
-    paths of 64 moves; pass another number to `gymnasium.make`), or after the number of paths set
+    paths of 64 moves, or the length of the task whose id it is; pass another number to
+    `gymnasium.make`, as for paths of another length), or after the number of paths set
     by the task or by the running server's `--max-steps`.
 
     ## Starting State, Information

@@ -92,8 +92,9 @@ class WildfireEnv(WorldEnv):
 
     ## Episode End
 
-    Never `terminated`. `truncated` after `max_episode_steps` (default 1,000; pass another number to
-    `gymnasium.make`), or after the number of steps set by the task or by the running server's
+    Never `terminated`. `truncated` after `max_episode_steps` (default 1,000, or the length of the
+    task whose id it is; pass another number to `gymnasium.make`, as for a task file with longer
+    episodes), or after the number of steps set by the task or by the running server's
     `--max-steps`.
 
     ## Information

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.common.output import end_with_reader
 from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape import land
@@ -241,4 +242,5 @@ def _crop(text: str) -> tuple[int, ...]:
 
 
 if __name__ == "__main__":
+    end_with_reader()
     main()

@@ -17,6 +17,7 @@ from emberwatch.belief.prior import PriorKind, prior_of
 from emberwatch.client import recording
 from emberwatch.client.observer import Frame
 from emberwatch.client.replies import ServerInfo
+from emberwatch.common.output import end_with_reader
 from emberwatch.common.paths import shown
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.model import Model
@@ -218,4 +219,5 @@ def _pictures(page: Page, scenes: Iterator[Scene], n_scenes: int, fps: float) ->
 
 
 if __name__ == "__main__":
+    end_with_reader()
     main()
