@@ -191,6 +191,27 @@ def test_a_gap_before_the_kept_frames_is_told_once() -> None:
             BeliefObservation(second).reset(options={"resume": True})
 
 
+def test_a_belief_never_continues_another_episode_with_the_same_last_frame() -> None:
+    flown, others = ((0, 0, 2), (3, 2, 2))  # both observe only the corner at last
+    with serving(model=LIVELY) as instance:
+        first, second = (
+            BeliefObservation(make(instance=instance, observation="frame"), keep=True)
+            for _ in range(2)
+        )
+        n_same = 0
+        for seed in range(3):
+            last = []
+            for env, moves in ((first, flown), (second, others)):
+                env.reset(seed=seed)
+                last.append([env.step([move] * 4)[0] for move in moves][-1])
+                env.close()
+            joined, _ = first.reset(options={"resume": True})
+            first.close()
+            assert_same(joined, last[1])
+            n_same += np.array_equal(last[0]["frame"], last[1]["frame"])
+        assert n_same > 0
+
+
 def test_fires_persist_in_small_worlds() -> None:
     keywords = {**SMALL, "n_moves": 1, "burn_in": 1000}
     worlds = gymnasium.make_vec(WILDFIRE, num_envs=50, max_episode_steps=-1, truth=True, **keywords)

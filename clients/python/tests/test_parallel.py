@@ -4,11 +4,13 @@ import sys
 import warnings
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from environments import (
+    LIVELY,
     OBJECTIVE,
     SMALL,
     assert_same,
@@ -79,6 +81,56 @@ def random_actions(n_steps: int, n_robots: int, shape: tuple[int, ...] = ()) -> 
 
 
 PARTS = ("frame", "robot", "age", "belief", "team", "others")
+
+
+def flight(env: WildfireParallelEnv, **of_reset: Any) -> tuple[int, int]:
+    """Returns the number of steps and the world's step at the end of an episode."""
+    n_steps, info = 0, env.reset(**of_reset)[1]
+    while env.agents:
+        action = np.full(env.action_space("robot_0").shape, n_steps % 4)
+        *_, info = env.step(dict.fromkeys(env.agents, action))
+        n_steps += 1
+    return n_steps, info["robot_0"]["step"]
+
+
+def test_episodes_end_with_the_paths_of_the_task_or_where_the_user_says(tmp_path: Path) -> None:
+    task = (Path(__file__).parents[3] / "config/tasks/team.toml").read_text("utf-8")
+    task = task.replace('"team"', '"own"').replace("burn_in = 3000", "burn_in = 3")
+    assert "max_steps = 300\n" in task
+    for n_paths, lengths in ((3, (48, 3)), (70, (1120, 70))):
+        file = tmp_path / f"{n_paths}.toml"
+        file.write_text(task.replace("max_steps = 300\n", f"max_steps = {n_paths}\n"), "utf-8")
+        assert flight(emberwatch.parallel_env(task=file), seed=1000) == lengths
+        assert flight(emberwatch.parallel_env(task=file, action="path"), seed=1000)[0] == n_paths
+        given = emberwatch.parallel_env(task=file, max_episode_steps=17)
+        assert flight(given, seed=1000) == (17, 1)
+    assert flight(team(robots=1, n_moves=3), seed=1) == (3000, 1000)
+
+
+def test_a_team_resumed_within_a_path_loses_no_move() -> None:
+    keywords: dict[str, Any] = {"observation": ("local", "recent", "visited", "move"), "robots": 2}
+    whole, halved = team(**keywords), team(max_episode_steps=6, **keywords)
+    whole.reset(seed=1)
+    halved.reset(seed=1)
+    before: Any = None
+    for step, action in enumerate(random_actions(21, 2)):
+        if not halved.agents:
+            assert step % 6 == 0
+            assert_same(halved.reset(options={"resume": True})[0], before)
+        outcomes = whole.step(action), halved.step(action)
+        before = outcomes[0][0]
+        assert_same(outcomes[0][:2], outcomes[1][:2])
+        assert_same(outcomes[0][4], outcomes[1][4])
+
+
+def test_a_team_joins_an_episode_with_its_earlier_frames() -> None:
+    with serving(model=LIVELY, robots=2) as instance:
+        keywords = {"instance": instance, "action": "path", "observation": PARTS}
+        first, second = team(**keywords), team(**keywords)
+        last = rollout(first, random_actions(7, 2, (4,)), 4)[-1][0]
+        first.close()
+        assert_same(second.reset(options={"resume": True})[0], last)
+        second.close()
 
 
 @pytest.mark.parametrize("reward", ["share", "team", "marginal"])

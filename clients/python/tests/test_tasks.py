@@ -231,6 +231,18 @@ def own(tmp_path: Path) -> Path:
     return file
 
 
+def test_a_task_ends_episodes_unless_the_id_or_the_user_does(own: Path) -> None:
+    own.write_text(own.read_text("utf-8").replace("max_steps = 300", "max_steps = 1003"), "utf-8")
+    many: Any = partial(gymnasium.make_vec, num_envs=1)
+    for maker in (gymnasium.make, many):
+        for keywords, length in (({}, 1000), ({"max_episode_steps": -1}, 1003)):
+            env, n_steps, ends = closed_later(maker(WILDFIRE, task=own, **keywords)), 0, False
+            env.reset(seed=1000)
+            while not ends:
+                ends, n_steps = bool(env.step(env.action_space.sample())[3]), n_steps + 1
+            assert n_steps == length
+
+
 def test_an_episode_on_a_test_world_warns(own: Path) -> None:
     for maker in ON_TEST_WORLDS:
         env = closed_later(maker(own))

@@ -114,7 +114,6 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             self._belief = load(checkpoint, **grid, kind=kind, model=found)
         #: Whether an episode has begun and no step since then was interrupted.
         self._is_begun = self._was_begun = False
-        self._frame = np.empty(0, np.uint8)
         self._step = 0
         self.observation_space = self._space(original, height, width)
 
@@ -148,19 +147,19 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             belief.predict()
         if self._step > before:
             belief.correct(_frame_of(observation))
-        self._is_begun, self._frame = True, _frame_of(observation).copy()
+        self._is_begun = True
         return self._observe(observation), reward, terminated, truncated, info
 
     def _begin(self, step: int, frame: NDArray[np.uint8]) -> None:
         """Begins an episode, or joins one at a later step."""
-        is_next = self._was_begun and step == self._step and np.array_equal(frame, self._frame)
-        if step == 0 or not is_next:  # otherwise the episode continues where this wrapper left it
+        continues = getattr(self.env.unwrapped, "continues", False)
+        if not (continues and self._was_begun and step == self._step):
             self._belief.reset()
             for past in self._past_frames(step):
                 self._belief.correct(past)
                 self._belief.predict()
             self._belief.correct(frame)
-        self._step, self._frame, self._is_begun = step, frame.copy(), True
+        self._step, self._is_begun = step, True
 
     def _past_frames(self, step: int) -> Iterable[NDArray[np.uint8]]:
         if step == 0:

@@ -46,6 +46,8 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         #: The robot's index in a world that other clients fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
         self._n_missed = 0
+        #: Whether the last reset continued the episode where this environment left it.
+        self.continues = False
         self._answer: StepAnswer | None = None
         self._truth: NDArray[np.uint8] | None = None
         self._path: NDArray[np.intp] | None = None
@@ -72,11 +74,8 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         step = int(self._answer.worlds["step"][0])
         return (past.frames[0] for past in self._session.history(0, step))
 
-    def _begin(self, seed: int | None, options: dict[str, Any] | None) -> tuple[StepAnswer, bool]:
-        """Begins an episode, or continues the world's current one.
-
-        Returns the answer, and whether it is the one that the environment has already processed.
-        """
+    def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
+        """Begins an episode, or continues the world's current one; sets `continues`."""
         processed = None if self._session.is_unfinished else self._answer
         resumes = wants_to_resume(options, seed) or self._robot is not None
         seed = None if seed is None else as_seed(seed)
@@ -90,10 +89,10 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
             drawn = draw_seed(self.np_random) if seed is None else seed
             answer = self._session.reset([0], [drawn])
         told = processed.results.tobytes() if resumes and processed is not None else None
-        continues = answer.results.tobytes() == told
-        if not continues:
+        self.continues = answer.results.tobytes() == told
+        if not self.continues:
             self._path, self._n_missed = None, 0
-        return answer, continues
+        return answer
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
         """Updates the observations with one empty frame per missed step, then with `answer`."""

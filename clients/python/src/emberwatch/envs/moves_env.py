@@ -138,8 +138,8 @@ class WildfireMovesEnv(WorldEnv):
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
         with self._session.turn:
-            answer, continues = self._begin(seed, options)
-            if not continues:
+            answer = self._begin(seed, options)
+            if not self.continues:
                 self._observations.begin(ONE_ROW, answer.results, answer.frames)
                 self._begin_path(answer)
             seen = self._seen(answer)

@@ -106,8 +106,8 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begins an episode; see `WildfireEnv`."""
         with self._session.turn:
-            answer, continues = self._begin(seed, options)
-            if not continues:
+            answer = self._begin(seed, options)
+            if not self.continues:
                 self._plans.begin(ONE_ROW, answer.results, answer.frames)
             seen = self._seen(answer)
             self._session.finish()

@@ -168,9 +168,9 @@ class WildfireEnv(WorldEnv):
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
         with self._session.turn:
-            answer, continues = self._begin(seed, options)
+            answer = self._begin(seed, options)
             self._answer = answer
-            if not continues:
+            if not self.continues:
                 self._observations.begin(ONE_ROW, answer.results, answer.frames)
             _, _, _, step, n_visited, cells = answer.native.numbers(self._pays)
             seen = self._seen(answer, step, n_visited, cells)
