@@ -114,10 +114,11 @@ mod tests {
             let mut both = [(); 2].map(|()| (kind.build)(&conditions).expect("a belief"));
             for step in 0..3 {
                 for one in &mut both {
-                    one.correct(&frame(&[(step, 0), (9, 1)])).expect("possible");
+                    one.correct(&frame(&[(step, 0), (29, 1)]))
+                        .expect("possible");
                 }
                 // The first cells are possible, the last one is not.
-                let refused = both[0].correct(&frame(&[(20, 0), (29, 2), (9, 2)]));
+                let refused = both[0].correct(&frame(&[(9, 2), (20, 0), (29, 2)]));
                 assert!(refused.is_err(), "{kind:?}");
                 for _ in 0..2 {
                     let bytes = both

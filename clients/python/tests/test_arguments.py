@@ -252,6 +252,9 @@ GIVEN_LONG: dict[str, Callable[[Any], object]] = {
     "known": lambda long: belief.known(long, prior=np.ones((3, 4, 4)) / 3),
     "kind": lambda long: belief.load("no", height=4, width=4, kind=long),
     "policy": lambda long: evaluate(lambda seen: seen, name="mine", env=long),
+    "key of a file": lambda long: Model.named(f'\n"{long}" = 1'),
+    "length": lambda long: make_vec(2, max_episode_steps=long),
+    "lengths": lambda long: emberwatch.parallel_env(max_episode_steps=long),
     "baseline": lambda long: make(OBJECTIVE, estimator=long),
     "state": lambda long: Model.named(Path(LIVELY).read_text().replace('"latent"', f'"{long}"', 1)),
     "checkpoint": lambda long: make(OBJECTIVE, checkpoint=long),
@@ -277,6 +280,7 @@ def test_a_refusal_quotes_little_of_a_long_value(of: str, long: str) -> None:
         GIVEN_LONG[of](long)
     text = str(refused.value)
     assert len(text) < 700, text
+    assert long[:90] not in text
     assert max(map(len, text.splitlines())) < 600, text
 
 

@@ -184,3 +184,14 @@ def test_it_observes_other_kinds_of_belief(tmp_path: Path) -> None:
     assert env.filter.kind == "neural" and env.step(None)[0] in env.observation_space
     with refuses("prior: expected None with a checkpoint"):
         BeliefObservation(Stub(), checkpoint=checkpoint, prior="uniform")
+
+
+def test_a_spec_keeps_absolute_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.toml").write_text(WILDFIRE.toml)
+    monkeypatch.chdir(tmp_path)
+    env = BeliefObservation(gymnasium.make("test/Stub-v0"), model="mine.toml")
+    monkeypatch.chdir("/")
+    assert env.spec is not None
+    (wrapper,) = [it for it in env.spec.additional_wrappers if it.name == "BeliefObservation"]
+    assert wrapper.kwargs is not None
+    assert wrapper.kwargs["model"] == str(tmp_path / "mine.toml")

@@ -53,7 +53,9 @@ def test_the_next_process_simulates_if_one_is_killed_and_ctrl_c_ends_the_wait(
     waits.signal(signal.SIGINT)
     code, _, error = waits.end()
     assert code in (1, 130, -signal.SIGINT) and "KeyboardInterrupt" in error
-    before = cpu_seconds(next_one.pid)
+    before, begun = cpu_seconds(next_one.pid), cpu_seconds(first.pid)
+    assert eventually(lambda: cpu_seconds(first.pid) > begun + 1)
+    assert cpu_seconds(next_one.pid) < before + 0.3  # it waits
     first.signal(signal.SIGKILL)
     assert eventually(lambda: cpu_seconds(next_one.pid) > before + 0.5)
 

@@ -39,11 +39,28 @@ pub fn shortened(value: &str) -> Cow<'_, str> {
     format!("{begin}…{end}").into()
 }
 
-/// Returns an error of a parser, which quotes lines and values of the text that it read, with each line and each word
-/// of at most 80 characters beyond its sentence.
+/// Returns an error of a parser, with at most 80 characters of each line, quoted value and word of the text that it read.
 pub fn parse_problem(error: impl Display) -> String {
     let text = error.to_string();
     let words = |line: &str| line.split(' ').map(shortened).collect::<Vec<_>>().join(" ");
+    // Between the first and the last quote of a kind may be a value with quotes in it, so each part is shortened.
+    let quoted = |line: &str| {
+        let parts = line.split_inclusive(['`', '"']).enumerate();
+        let part = |(index, part): (usize, &str)| {
+            let most = if index % 2 == 1 {
+                MAX_QUOTED + 1
+            } else {
+                2 * MAX_QUOTED
+            };
+            let is_long = part.chars().count() > most;
+            if is_long {
+                shortened(part).into_owned()
+            } else {
+                part.to_owned()
+            }
+        };
+        parts.map(part).collect::<String>()
+    };
     let cut = |line: &str| match line.split_once('|') {
         // A line of the text, or the marks under it.
         Some((number, rest))
@@ -54,7 +71,7 @@ pub fn parse_problem(error: impl Display) -> String {
                 rest.chars().take(MAX_QUOTED).collect::<String>().trim_end()
             )
         }
-        _ => words(line),
+        _ => quoted(&words(line)),
     };
     text.lines().map(cut).collect::<Vec<_>>().join("\n")
 }
@@ -109,6 +126,10 @@ mod tests {
             told.lines().all(|line| line.chars().count() < 120),
             "{told}"
         );
+        let key = "word ".repeat(900);
+        let told = parse_problem(format!("unknown field `{key}`, expected one of `a`, `b`"));
+        assert!(told.ends_with("`, expected one of `a`, `b`"), "{told}");
+        assert!(told.chars().count() < 140, "{told}");
     }
 
     #[test]

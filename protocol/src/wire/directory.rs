@@ -151,7 +151,7 @@ fn others(folder: &std::path::Path, own: u32) -> Option<String> {
     let sentence = || {
         let users = users.join(", ");
         format!(
-            "programs of user {users} run here, too, but a program of user {own} reaches only servers of user {own}"
+            "other users (id {users}) have channels here, but this program reaches only servers of user {own}: run both as one user"
         )
     };
     (!users.is_empty()).then(sentence)
@@ -239,7 +239,7 @@ mod tests {
         }
         let hint = others(&folder, 3).expect("two users");
         assert!(
-            hint.contains("user 5, 1000 run here") && hint.contains("of user 3 reaches"),
+            hint.contains("(id 5, 1000)") && hint.contains("servers of user 3: run"),
             "{hint}"
         );
         assert_eq!(others(&folder.join("none"), 3), None);

@@ -27,16 +27,14 @@ pub const LONGEST_WAIT: Duration = Duration::from_secs(300);
 /// Interval between two attempts to lock.
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// The right to make a belief. It ends with its process.
+/// The right to make a belief. It ends with its process, unless a forked child has a copy of the descriptor.
 struct Making {
     file: File,
-    path: PathBuf,
 }
 
 impl Drop for Making {
     fn drop(&mut self) {
-        let _ = std::fs::remove_file(&self.path);
-        // Closing the file is not enough, because the child of a fork may have a copy of the descriptor.
+        // The file stays, as others may wait for it. Closing the file is not enough, because the child of a fork may have a copy of the descriptor.
         let _ = self.file.unlock();
     }
 }
@@ -70,7 +68,7 @@ impl KeptBelief {
     }
 
     /// Returns the cached belief, or makes and caches it. If another process is making it, first waits until that
-    /// process ends, for at most [`LONGEST_WAIT`]; `pause` sleeps for the given time.
+    /// is done, for at most [`LONGEST_WAIT`]; `pause` sleeps for the given time.
     ///
     /// # Errors
     /// Those of `make` and `pause`.
@@ -106,7 +104,7 @@ impl KeptBelief {
         let start = Instant::now();
         while start.elapsed() < LONGEST_WAIT {
             match file.try_lock() {
-                Ok(()) => return Ok(Some(Making { file, path })),
+                Ok(()) => return Ok(Some(Making { file })),
                 Err(TryLockError::WouldBlock) => pause(PAUSE)?,
                 Err(TryLockError::Error(_)) => break,
             }
@@ -198,11 +196,13 @@ fn remove_oldest(folder: &Path, max_files: usize) {
         Some((changed.unwrap_or(SystemTime::UNIX_EPOCH), path))
     };
     let mut files: Vec<_> = entries.filter_map(age).collect();
+    files.retain(|(_, path)| path.extension().is_some_and(|end| end == "belief"));
     files.sort();
     let n_too_many = files.len().saturating_sub(max_files);
     for (_, path) in &files[..n_too_many] {
         // Ignore errors, because another agent may have removed the file already.
         let _ = std::fs::remove_file(path);
+        let _ = std::fs::remove_file(path.with_extension("lock"));
     }
 }
 
@@ -300,7 +300,6 @@ mod tests {
             }
         });
         assert_eq!(n_made.load(Ordering::SeqCst), 1);
-        assert!(!folder.path().join("new/a.lock").exists());
         // A process that ends leaves the right to the next one; a wait can be interrupted.
         std::fs::remove_file(&kept.path).expect("removed");
         let failed = kept.read_or_make(pause, || Err("no".into()));
@@ -315,13 +314,21 @@ mod tests {
     #[test]
     fn the_oldest_files_are_removed() {
         let folder = tempfile::TempDir::new().expect("a folder");
-        for (name, seconds) in [("a", 20), ("b", 10), ("c", 30)] {
+        for (name, seconds) in [
+            ("a.belief", 20),
+            ("b.belief", 10),
+            ("c.belief", 30),
+            ("d.lock", 1),
+        ] {
             let file = File::create(folder.path().join(name)).expect("a file");
             let changed = SystemTime::UNIX_EPOCH + Duration::from_secs(seconds);
             file.set_modified(changed).expect("a time");
         }
         remove_oldest(folder.path(), 2);
         let is_there = |name| folder.path().join(name).exists();
-        assert_eq!(["a", "b", "c"].map(is_there), [true, false, true]);
+        assert_eq!(
+            ["a.belief", "b.belief", "c.belief", "d.lock"].map(is_there),
+            [true, false, true, true]
+        );
     }
 }

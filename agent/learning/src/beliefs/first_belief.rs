@@ -6,6 +6,7 @@ use emberwatch_belief::estimation::kept_belief::KeptBelief;
 use emberwatch_belief::estimation::prior::Prior;
 use emberwatch_model::ModelError;
 use emberwatch_model::{Model, Shape};
+use std::cell::Cell;
 
 /// Number of cell updates that one core simulates per second: one step of 64 x 64 cells of the wildfire takes 3.4 us.
 const CELLS_PER_SECOND: f64 = 1.2e9;
@@ -24,7 +25,11 @@ pub fn first_belief(
         announce(n_worlds, burn_in, shape);
         prior.belief(model, shape, seed)
     };
+    let is_told = Cell::new(false);
     let pause = |time| {
+        if !is_told.replace(true) {
+            tracing::info!("another process simulates the first belief: waiting for it");
+        }
         std::thread::sleep(time);
         Ok(())
     };

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from emberwatch.belief import Belief, known, load
 from emberwatch.belief.prior import PriorKind, prior_of
 from emberwatch.common.arguments import as_json
+from emberwatch.common.paths import absolute
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
 from emberwatch.model import Model
 
@@ -88,9 +89,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             keep=keep,
             dtype=dtype,
             prior=as_json(prior),
-            model=as_json(model),
+            model=as_json(absolute(model)),
             kind=kind,
-            checkpoint=as_json(checkpoint),
+            checkpoint=as_json(absolute(checkpoint)),
         )
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):

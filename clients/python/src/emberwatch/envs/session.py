@@ -254,9 +254,9 @@ class Session:
             except EmberwatchError as error:
                 if error.code != "not_kept":
                     raise
-                if past > 0:
-                    return
-                past = error.detail - 1
+                if error.detail <= past:
+                    return  # another episode has begun
+                past = error.detail - 1  # earlier steps are gone, perhaps since the last recall
                 if not self._has_warned_of_gap:
                     self._has_warned_of_gap = True
                     warn(about_forgotten_steps(row, error.detail))

@@ -135,8 +135,8 @@ class Settings:
                 hint = _REMOVED.get(name, hint)
                 # This is Python's own message, which TorchRL parses to find a keyword to leave out.
                 raise TypeError(
-                    f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
-                    f"known keywords: {', '.join(sorted(known))}"
+                    f"{environment.__name__}() got an unexpected keyword argument "
+                    f"{repr_of(name)}{hint}; known keywords: {', '.join(sorted(known))}"
                 )
         asked = cls(**world)
         return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)

@@ -70,8 +70,10 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         """`pays` is the kind of reward, an index in `base.REWARDS`."""
         if max_episode_steps == -1:  # means no limit in `gymnasium.make`
             max_episode_steps = None
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise invalid("max_episode_steps", "at least 1 or None", max_episode_steps)
+        if max_episode_steps is not None:
+            given, max_episode_steps = max_episode_steps, as_integer(max_episode_steps)
+            if max_episode_steps is None or max_episode_steps < 1:
+                raise invalid("max_episode_steps", "at least 1 or None", repr_of(given))
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._session, self._spec = session, session.spec
         spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
