@@ -4,7 +4,8 @@
 //! may be a file of results.
 
 use emberwatch_messages::limits::threads::spawn;
-use std::backtrace::Backtrace;
+use emberwatch_model::text::shortened;
+use std::backtrace::{Backtrace, BacktraceStatus};
 use std::io::{IsTerminal, Write, stderr};
 use std::mem::take;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -65,14 +66,22 @@ pub fn start_logging() -> Log {
         .with(log.with_filter(filter.clone().unwrap_or_else(default)))
         .init();
     std::panic::set_hook(Box::new(|panic| {
-        let text = format!("{panic}\n{}\n", Backtrace::capture());
+        let thread = std::thread::current();
+        let calls = Backtrace::capture();
+        let calls = match calls.status() {
+            BacktraceStatus::Captured => calls.to_string(),
+            _ => "RUST_BACKTRACE=1 shows the calls".into(),
+        };
+        let name = thread.name().unwrap_or("unnamed");
+        let text = format!("thread '{name}' {panic}\n{calls}\n");
         // `Lines` never fails.
         let _ = Lines.write_all(text.as_bytes());
     }));
     if filter.is_none() {
         tracing::warn!(
             "RUST_LOG: expected a level (off, error, warn, info, debug, trace) or CRATE=LEVEL, such as \
-             emberwatch_agent=debug, separated by commas, got {wanted:.80}; logging at {DEFAULT}"
+             emberwatch_agent=debug, separated by commas, got {}; logging at {DEFAULT}",
+            shortened(&wanted)
         );
     }
     Log

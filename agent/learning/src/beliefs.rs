@@ -21,7 +21,6 @@ pub use self::learned::{LEARNED, LEARNED_CAVITIES, LEARNED_SPATIAL, LEARNED_SPAT
 pub use self::neural::{NEURAL, NEURAL_SENSOR};
 pub use self::truth::{NONE, TRUTH};
 pub use self::world_form::WorldForm;
-
 use emberwatch_model::text::shortened;
 
 /// All kinds, ordered by how much they know about the world.

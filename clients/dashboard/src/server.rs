@@ -107,7 +107,7 @@ async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Re
     let upgrade = upgrade
         .max_message_size(MAX_ASK_BYTES)
         .max_frame_size(MAX_ASK_BYTES);
-    // A browser tells its page nothing about a refused upgrade, so the reason is that of a closed socket.
+    // A page learns nothing about a refused upgrade, so the reason is sent when the socket closes.
     let Ok(place) = service.places.clone().try_acquire_owned() else {
         return upgrade.on_upgrade(close_full);
     };
@@ -125,13 +125,15 @@ async fn close_full(mut socket: WebSocket) {
         code: close_code::AGAIN,
         reason: reason.into(),
     };
-    // The socket ends when the browser has answered, or does not.
     if send(&mut socket, Message::Close(Some(frame)))
         .await
-        .is_some()
+        .is_none()
     {
-        let _ = timeout(SILENCE, socket.recv()).await;
+        return;
     }
+    // Requests that the browser sent before it learned the reason come first; then the socket ends.
+    let ends = async { while let Some(Ok(_)) = socket.recv().await {} };
+    let _ = timeout(SILENCE, ends).await;
 }
 
 /// Answers each request with one picture, until the browser leaves or sends an invalid message.

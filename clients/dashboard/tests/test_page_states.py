@@ -31,7 +31,7 @@ def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
     assert not look.at("panel-truth").is_visible()
 
 
-def test_a_browser_beyond_the_limit_is_told_so_until_another_leaves(watched, open_page):
+def test_a_browser_beyond_the_limit_is_refused_until_another_leaves(watched, open_page):
     """The dashboard serves 32 browsers: this page, and 31 more sockets."""
     many = """() => Promise.all(Array.from({ length: 31 }, () => new Promise((opened) => {
         const socket = new WebSocket(new URL("socket", location.href));

@@ -7,15 +7,12 @@ use crate::wire::Connection;
 use emberwatch_messages::backend::Backend;
 use emberwatch_messages::limits::threads::spawn;
 use emberwatch_model::Model;
-use emberwatch_model::built_in::state_names;
-use emberwatch_model::task::Task;
 use emberwatch_sim::config::{Checked, ServerConfig, model_named};
 use emberwatch_sim::embedded::{Embedded, wait_for};
 use emberwatch_sim::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 use std::ops::Range;
-use std::path::Path;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
@@ -43,7 +40,7 @@ const LEASE_MILLIS: u64 = 86_400_000;
 /// Settings of worlds in this process, with the files that they name, which are read only here.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct CheckedSettings {
-    /// The given settings as JSON, with absolute paths.
+    /// The given settings as JSON.
     given: String,
     checked: Checked,
 }
@@ -136,14 +133,13 @@ impl CheckedSettings {
     }
 
     fn read(py: Python<'_>, settings: &str) -> PyResult<Self> {
-        let mut given: Map<String, Value> =
+        let asked: Map<String, Value> =
             serde_json::from_str(settings).map_err(|error| refused(py, error))?;
-        let paths: Vec<String> = given
+        let paths: Vec<String> = asked
             .values()
             .filter_map(Value::as_str)
             .map(Into::into)
             .collect();
-        let asked = given.clone();
         let read = move || {
             let settings = ServerConfig {
                 lease_millis: LEASE_MILLIS,
@@ -152,12 +148,7 @@ impl CheckedSettings {
             settings.with(&asked).and_then(ServerConfig::check)
         };
         let checked = in_time(py, &paths, read)?.map_err(|problem| refused(py, problem))?;
-        for name in ["task", "model", "states"] {
-            if let Some(Value::String(path)) = given.get_mut(name) {
-                make_absolute(path);
-            }
-        }
-        let given = Value::Object(given).to_string();
+        let given = settings.into();
         Ok(Self { given, checked })
     }
 }
@@ -204,17 +195,6 @@ fn text_of(model: &Model) -> String {
     toml::to_string(model.file()).expect("invariant: a model was read from TOML")
 }
 
-/// Makes the path of a file absolute. Names of built-in files stay.
-fn make_absolute(path: &mut String) {
-    let mut built_in = Task::built_in_names()
-        .chain(Model::built_in_names())
-        .chain(state_names());
-    let is_file = Path::new(path).exists() && !built_in.any(|name| name == path);
-    if let (true, Ok(absolute)) = (is_file, std::path::absolute(&*path)) {
-        *path = absolute.display().to_string();
-    }
-}
-
 /// Runs `read`. If one of the paths is a pipe, device or other special file, a separate thread runs it, so that the wait
 /// can time out or be interrupted.
 fn in_time<T: Send + 'static>(
@@ -232,7 +212,7 @@ fn in_time<T: Send + 'static>(
     read.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))
 }
 
-/// Returns whether a path is that of a pipe, device or other special file, which can keep its reader waiting.
+/// Returns whether a path names a pipe, device or other special file, which can keep its reader waiting.
 fn may_block(path: &String) -> bool {
     let found = std::fs::metadata(path);
     found.is_ok_and(|kind| !kind.is_file() && !kind.is_dir())

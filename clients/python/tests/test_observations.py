@@ -177,7 +177,7 @@ def test_a_robot_joins_its_team_with_its_earlier_frames() -> None:
         assert_same(second.reset()[0], last)
 
 
-def test_a_gap_before_the_kept_frames_is_told_once() -> None:
+def test_a_gap_before_the_kept_frames_causes_one_warning() -> None:
     with serving(model=LIVELY, history=3) as instance:
         first = make(instance=instance)
         rollout(first, 9, seed=4)

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from environments import LIVELY, RECORDED, WILDFIRE, serving
+from environments import LIVELY, RECORDED, WILDFIRE, make, serving
 from failures import refuses
 from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, netcdf
 
@@ -120,6 +120,18 @@ def test_rasters_load_from_any_folder_in_any_locale(locale: dict[str, str], tmp_
     for subject, (code, _, err) in (("file", file), ("--name", name)):
         (line,) = err.splitlines()
         assert (code, f": {subject}: {EXPECTED}" in line) == (2, True)
+
+
+def test_a_folder_that_is_not_utf_8_has_usable_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / LATIN
+    folder.mkdir()
+    shutil.copy(LIVELY, folder / "mine.toml")
+    monkeypatch.chdir(folder)
+    env = make(model="mine.toml")
+    env.reset(seed=1)
+    assert env.spec.kwargs["model"] == "mine.toml"
 
 
 def test_paths_that_are_not_utf_8_are_refused() -> None:

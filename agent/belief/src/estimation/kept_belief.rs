@@ -22,7 +22,7 @@ const MAX_BYTES: usize = 4 << 20;
 const CHECKSUM_BYTES: usize = 4;
 
 /// Maximum time to wait for a process that makes the same belief.
-pub const LONGEST_WAIT: Duration = Duration::from_secs(300);
+const LONGEST_WAIT: Duration = Duration::from_secs(300);
 
 /// Interval between two attempts to lock.
 const PAUSE: Duration = Duration::from_millis(20);
@@ -34,7 +34,8 @@ struct Making {
 
 impl Drop for Making {
     fn drop(&mut self) {
-        // The file stays, as others may wait for it. Closing the file is not enough, because the child of a fork may have a copy of the descriptor.
+        // The file stays, as others may wait for it. Closing the file is not enough, because the child of a fork may
+        // have a copy of the descriptor.
         let _ = self.file.unlock();
     }
 }
@@ -68,7 +69,7 @@ impl KeptBelief {
     }
 
     /// Returns the cached belief, or makes and caches it. If another process is making it, first waits until that
-    /// is done, for at most [`LONGEST_WAIT`]; `pause` sleeps for the given time.
+    /// is done, for at most five minutes; `pause` sleeps for the given time.
     ///
     /// # Errors
     /// Those of `make` and `pause`.

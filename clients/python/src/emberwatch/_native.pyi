@@ -98,7 +98,8 @@ class CheckedSettings:
         """Name, moves, robots, steps, first and end of the test seeds, and prefix of ids."""
 
     @property
-    def worlds_fingerprint(self) -> str: ...
+    def worlds_fingerprint(self) -> str:
+        """Digits that identify the worlds, apart from their seeds."""
 
 _Numbers = tuple[float, bool, bool, int, int, NDArray[np.int64]]
 _Columns = tuple[

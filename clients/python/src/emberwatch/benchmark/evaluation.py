@@ -23,7 +23,7 @@ from emberwatch.benchmark.tally import Tally
 from emberwatch.client import wire
 from emberwatch.client.client import Client
 from emberwatch.common.arguments import as_count, as_list, as_seed
-from emberwatch.common.paths import absolute
+from emberwatch.common.paths import with_absolute_paths
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
 from emberwatch.envs.settings import Settings, WorldArguments
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
@@ -151,9 +151,7 @@ def _with_defaults(
     if burn_in is None and all(keywords.get(it) is None for it in ("task", "instance", "states")):
         burn_in = 25_000
     # Hidden states can arrive late on a busy machine.
-    keywords = {"timeout": 30.0, **keywords, "burn_in": burn_in}
-    for name in {"task", "model", "states", "checkpoint"} & keywords.keys():
-        keywords[name] = absolute(keywords[name])
+    keywords = {"timeout": 30.0, **with_absolute_paths(keywords), "burn_in": burn_in}
     if keywords.get("instance") is not None:
         with Client(keywords["instance"]) as client:
             info = client.info

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
 from emberwatch.common import codes
-from emberwatch.common.paths import utf8
+from emberwatch.common.paths import utf8, with_absolute_paths
 from emberwatch.errors import invalid, repr_of, shortened
 
 _Value = TypeVar("_Value")
@@ -26,7 +26,8 @@ def read_settings(settings: Mapping[str, object]) -> _native.CheckedSettings:
     Raises:
         InvalidArgumentError: If a server would refuse them.
     """
-    given = {name: as_setting(name, it) for name, it in settings.items() if it is not None}
+    given = with_absolute_paths(settings)
+    given = {name: as_setting(name, it) for name, it in given.items() if it is not None}
     return _native.CheckedSettings(json.dumps(given))
 
 

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Mapping
 from typing import Any, Final, cast
 
 import emberwatch._native as _native
@@ -9,6 +10,9 @@ from emberwatch.errors import invalid, repr_of, shortened
 
 #: Character that editors on Windows write at the beginning of UTF-8 text.
 BYTE_ORDER_MARK: Final = "\ufeff"
+
+#: Keywords that name files, or a built-in task, model or recorded world.
+_OF_FILES: Final = frozenset({"task", "model", "states", "checkpoint"})
 
 
 def utf8(subject: str, path: str | os.PathLike[str]) -> str:
@@ -25,13 +29,25 @@ def utf8(subject: str, path: str | os.PathLike[str]) -> str:
     return text
 
 
+def with_absolute_paths(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns keywords with absolute paths of files, as the program may change its folder."""
+    return {name: absolute(it) if name in _OF_FILES else it for name, it in keywords.items()}
+
+
 def absolute(name: Any) -> Any:
-    """Makes the path of a file absolute, as a policy may change the folder; other values stay."""
+    """Makes the path of a file absolute. Other values stay, also in a folder that is not UTF-8."""
     if not isinstance(name, (str, os.PathLike)):
         return name
     path = os.fspath(cast("str | os.PathLike[str]", name))
     is_built_in = any(path in _native.built_in(kind) for kind in ("models", "tasks", "states"))
-    return os.path.abspath(path) if os.path.exists(path) and not is_built_in else path
+    if is_built_in or not os.path.exists(path):
+        return path
+    whole = os.path.abspath(path)
+    try:
+        os.fsencode(whole).decode()
+    except UnicodeError:
+        return path
+    return whole
 
 
 def shown(text: str) -> str:

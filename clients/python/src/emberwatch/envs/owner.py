@@ -8,7 +8,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from emberwatch.client.lease import Lease
 from emberwatch.common.arguments import as_json
-from emberwatch.common.paths import absolute
+from emberwatch.common.paths import with_absolute_paths
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.model import Model
@@ -29,9 +29,7 @@ class SessionOwner:
     def spec(self, spec: EnvSpec | None) -> None:
         self._made_by = made_by = copy(spec)
         if made_by is not None:
-            made_by.kwargs = as_json(made_by.kwargs)
-            for name in {"task", "model", "states", "checkpoint"} & made_by.kwargs.keys():
-                made_by.kwargs[name] = absolute(made_by.kwargs[name])
+            made_by.kwargs = with_absolute_paths(as_json(made_by.kwargs))
 
     @property
     def model(self) -> Model | None:
