@@ -1,13 +1,15 @@
 //! Generates the tables of built-in models, tasks and recorded states that `src/built_in.rs` includes, from the folders
 //! of `config/`.
 
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 fn main() {
     let text = |file: &Path| format!("include_str!({file:?})");
-    write("models", entries("models", "toml", |file| text(&file)));
+    write("models", entries("models", "toml", |file| text(&with_maps(&file))));
     write("tasks", entries("tasks", "toml", |file| text(&file)));
     let states = entries("landscapes", "", |folder| {
         let file = folder.join(folder.file_name().expect("a name"));
@@ -15,6 +17,21 @@ fn main() {
         format!("include_bytes!({archive:?}), {}", text(&description))
     });
     write("states", states);
+}
+
+/// Writes a model file with its maps in place of the name of their file, and returns its path.
+fn with_maps(model: &Path) -> PathBuf {
+    let text = fs::read_to_string(model).expect("a model file in UTF-8");
+    let line = text.lines().find(|line| line.starts_with("maps = \""));
+    let packed = line.map(|line| {
+        let name = line.split('"').nth(1).expect("the name of a file");
+        let archive = fs::read(model.with_file_name(name)).expect("a readable archive");
+        let npz = BASE64.encode(archive);
+        text.replace(line, &format!("maps = {{ npz = \"{npz}\" }}"))
+    });
+    let out = out().join(model.file_name().expect("a name"));
+    fs::write(&out, packed.unwrap_or(text)).expect("write the model");
+    out
 }
 
 /// Lists the entries of a folder, sorted by name. Each entry is a Rust tuple of its name and `contents`. The entries
@@ -52,7 +69,10 @@ fn entries(folder: &str, extension: &str, contents: impl Fn(PathBuf) -> String) 
 }
 
 fn write(kind: &str, entries: Vec<String>) {
-    let out = std::env::var_os("OUT_DIR").expect("cargo names a folder");
-    let file = Path::new(&out).join(kind).with_extension("rs");
+    let file = out().join(kind).with_extension("rs");
     fs::write(file, format!("&[\n{}]\n", entries.concat())).expect("write the list");
+}
+
+fn out() -> PathBuf {
+    std::env::var_os("OUT_DIR").expect("cargo names a folder").into()
 }

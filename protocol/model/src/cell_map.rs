@@ -1,18 +1,13 @@
 //! Maps in a model file: a number for each cell, written in the file or in a `.npy` file next to it.
 
 use super::grid::{Grid, Shape};
+use super::npy::Npy;
 use crate::text::MAX_TEXT_BYTES;
 use ndarray::Array2;
-use ndarray_npy::ReadNpyExt;
-use ndarray_npy::npy::header::Header;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
-use std::io::{Cursor, Read};
+use std::io::Read;
 use std::path::{Path, PathBuf};
-
-/// Maximum size of an array's header. NumPy writes 128 bytes; nested brackets in a long header could overflow the
-/// parser's stack.
-const MAX_HEADER_BYTES: u16 = 512;
 
 /// A number for each cell of a grid.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -75,46 +70,30 @@ impl CellMap {
 }
 
 fn read_array(path: &Path) -> Result<Array2<u8>, String> {
-    let words = |error: &dyn std::fmt::Display| error.to_string();
-    let metadata = path.metadata().map_err(|error| words(&error))?;
+    let words = |error: std::io::Error| error.to_string();
+    let metadata = path.metadata().map_err(words)?;
     if !metadata.is_file() || metadata.len() > MAX_TEXT_BYTES {
         return Err(format!(
             "expected a .npy file of at most {MAX_TEXT_BYTES} bytes"
         ));
     }
     let mut bytes = Vec::new();
-    let file = File::open(path).map_err(|error| words(&error))?;
+    let file = File::open(path).map_err(words)?;
     let read = file.take(MAX_TEXT_BYTES).read_to_end(&mut bytes);
-    read.map_err(|error| words(&error))?;
-    let header = match bytes.strip_prefix(b"\x93NUMPY") {
-        Some([1, _, low, high, ..]) => u16::from_le_bytes([*low, *high]),
-        _ => return Err("expected a NumPy array".into()),
-    };
-    if header > MAX_HEADER_BYTES {
-        let expected = format!("expected a header of at most {MAX_HEADER_BYTES} bytes");
-        return Err(format!("{expected}, got {header}"));
-    }
-    // The parser allocates the size that the header claims, so check it against the size of the file first.
-    let mut rest = Cursor::new(&bytes);
-    let header = Header::from_reader(&mut rest).map_err(|error| words(&error))?;
-    let n_values = bytes.len() as u64 - rest.position();
-    let fits = match header.shape[..] {
-        [height, width] => {
-            Shape::new(height, width).is_ok_and(|it| it.n_cells() as u64 == n_values)
-        }
+    read.map_err(words)?;
+    let array = Npy::new(&bytes)?;
+    let is_grid = match array.shape[..] {
+        [height, width] => Shape::new(height, width).is_ok_and(|it| it.n_cells() == array.n_bytes),
         _ => false,
     };
-    if !fits {
-        let expected = "expected an array [H, W] of uint8 or bool";
-        return Err(format!(
-            "{expected}, got shape {:?} in {n_values} bytes",
-            header.shape
-        ));
-    }
-    let numbers = Array2::<u8>::read_npy(Cursor::new(&bytes));
-    let numbers = numbers.or_else(|error| {
-        let flags = Array2::<bool>::read_npy(Cursor::new(&bytes));
-        flags.map(|flags| flags.mapv(u8::from)).map_err(|_| error)
-    });
-    numbers.map_err(|error| format!("expected an array [H, W] of uint8 or bool: {error}"))
+    let numbers = || {
+        let flags = || Some(array.read::<bool>()?.mapv(u8::from));
+        array.read::<u8>().or_else(flags)
+    };
+    let numbers = is_grid.then(numbers).flatten();
+    let numbers = numbers.and_then(|numbers| numbers.into_dimensionality().ok());
+    numbers.ok_or_else(|| {
+        let (shape, n_bytes) = (&array.shape, array.n_bytes);
+        format!("expected an array [H, W] of uint8 or bool, got shape {shape:?} in {n_bytes} bytes")
+    })
 }

@@ -1,11 +1,12 @@
 //! Checks a [`ModelFile`] and converts it to arrays. An error names the first wrong entry.
 
-use super::cell_map::CellMap;
 use super::file::{
-    KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES, ModelError, ModelFile,
-    StateEntry, parse_color,
+    KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MIN_PROBABILITY, ModelError, ModelFile,
+    StateEntry, TransitionEntry, parse_color,
 };
-use super::grid::Grid;
+use super::grid::{Grid, Shape};
+use super::hazards::{Factors, Hazards, Near, Transition, hazard};
+use super::maps::Maps;
 use crate::text::shortened;
 use ndarray::{Array1, Array2, Array4};
 use std::collections::HashSet;
@@ -15,9 +16,8 @@ use std::ops::RangeInclusive;
 /// overflow nor vanish in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
-/// Maximum number of weights in all kernels together, 512 MiB. A model with 64 own-state kernels of 15 x 15 cells has
-/// 59 million.
-const MAX_WEIGHTS: usize = 1 << 26;
+/// Maximum factor of a map.
+const MAX_FACTOR: f32 = 1e6;
 
 /// Reserved names, which no state may have. A policy's goal is either the name of a state or one of these words.
 const RESERVED: [&str; 5] = ["coverage", "exploit", "exploit_only", "explore", "learned"];
@@ -41,7 +41,7 @@ impl Checker<'_> {
         })
     }
 
-    /// Checks the numbers of states, observations and zones, and their names and colours.
+    /// Checks the numbers of states and observations, and their names and colours.
     pub fn counts_and_names(&self, file: &ModelFile) -> Result<(), ModelError> {
         let states: Vec<_> = file.states.iter().map(|s| (&s.name, &s.color)).collect();
         let observations: Vec<_> = file
@@ -59,9 +59,7 @@ impl Checker<'_> {
                 return self.wrong("state name".into(), &expected, format!("{name:?}"));
             }
         }
-        self.entries("observation", "observations", 1..=MAX_VALUES, &observations)?;
-        let zones: Vec<_> = file.zones.iter().map(|z| (&z.name, &z.color)).collect();
-        self.entries("zone", "zones", 0..=MAX_ZONES, &zones)
+        self.entries("observation", "observations", 1..=MAX_VALUES, &observations)
     }
 
     fn entries(
@@ -167,31 +165,14 @@ impl Checker<'_> {
         Ok(likelihood)
     }
 
-    /// Returns the zone of each cell, if there are zones.
-    pub fn zone_map(&self, file: &ModelFile) -> Result<Option<Grid<u8>>, ModelError> {
-        let n_zones = file.zones.len();
-        let Some(map) = &file.zone_map else {
-            return match n_zones {
-                0 => Ok(None),
-                _ => self.wrong("zone_map".into(), "the zone of each cell", "none"),
-            };
-        };
-        let map = self.map("zone_map", map)?;
-        match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
-            None => Ok(Some(map)),
-            Some(got) => {
-                let expected = format!("zones below {n_zones}, the number of `zones`");
-                self.wrong("zone_map".into(), &expected, got)
-            }
-        }
-    }
-
     /// Returns whether each cell is closed to robots, if the file has a no-fly map.
     pub fn no_fly(&self, file: &ModelFile) -> Result<Option<Grid<bool>>, ModelError> {
         let Some(map) = &file.no_fly else {
             return Ok(None);
         };
-        let map = self.map("no_fly", map)?;
+        let map = map
+            .grid()
+            .or_else(|(expected, got)| self.wrong("no_fly".into(), &expected, got))?;
         if let Some(got) = map.iter().find(|&&flag| flag > 1) {
             return self.wrong("no_fly".into(), "0 or 1 for each cell", got);
         }
@@ -201,101 +182,189 @@ impl Checker<'_> {
         Ok(Some(map.mapv(|flag| flag == 1)))
     }
 
-    fn map(&self, what: &str, map: &CellMap) -> Result<Grid<u8>, ModelError> {
-        map.grid()
-            .or_else(|(expected, got)| self.wrong(what.into(), &expected, got))
+    /// Checks that a file has entries of one kind, and returns whether it is a model of hazards.
+    pub fn is_of_hazards(&self, file: &ModelFile) -> Result<bool, ModelError> {
+        let (has_kernel, has_transitions) = (!file.kernel.is_empty(), !file.transitions.is_empty());
+        if has_kernel == has_transitions {
+            let what = "kernel and transitions".into();
+            let got = if has_kernel { "both" } else { "none" };
+            return self.wrong(what, "entries of exactly one of them", got);
+        }
+        if !has_transitions {
+            return match &file.maps {
+                Some(_) => self.wrong("maps".into(), "none, because no transition uses them", "maps"),
+                None => Ok(false),
+            };
+        }
+        if let Some([height, width]) = file.kernel_size {
+            let expected = "none, because `near` has the size";
+            return self.wrong("kernel_size".into(), expected, format!("[{height}, {width}]"));
+        }
+        match file.states.iter().find(|state| state.bias != 0.0) {
+            Some(state) => {
+                let what = format!("state {:?}: bias", state.name);
+                self.wrong(what, "none, because transitions have `base`", state.bias)
+            }
+            None => Ok(true),
+        }
     }
 
-    /// Returns the kernels, zone by zone. Each zone has one kernel, or one for each own state (the state of the cell
-    /// itself).
-    pub fn kernels(&self, file: &ModelFile) -> Result<Vec<Array4<f64>>, ModelError> {
-        let [height, width] = file.kernel_size;
-        let odd = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
-        if !odd(height) || !odd(width) {
-            let expected = format!("two odd numbers up to {MAX_KERNEL_SIDE}");
-            return self.wrong(
-                "kernel_size".into(),
-                &expected,
-                format!("{:?}", file.kernel_size),
-            );
-        }
+    /// Returns the kernel of eq. 2, shape `[S, S, KH, KW]`.
+    pub fn kernel(&self, file: &ModelFile) -> Result<Array4<f64>, ModelError> {
+        let Some(size) = file.kernel_size else {
+            return self.wrong("kernel_size".into(), "the size of `weights`", "none");
+        };
+        self.is_odd("kernel_size".into(), size)?;
+        let [height, width] = size;
         let n_states = file.states.len();
-        let (n_zones, n_own) = (file.zones.len().max(1), self.n_own(file)?);
-        self.check_zones(file)?;
-        let n_weights = n_zones * n_own * n_states * n_states * height * width;
-        if n_weights > MAX_WEIGHTS {
-            let expected = format!("at most {MAX_WEIGHTS} weights in all zones");
-            return self.wrong("kernel".into(), &expected, n_weights);
-        }
-        let mut kernels = vec![Array4::zeros((n_states, n_states, height, width)); n_zones * n_own];
+        let mut kernel = Array4::zeros((n_states, n_states, height, width));
         let mut filled = HashSet::new();
         for entry in &file.kernel {
-            let own = match &entry.own {
-                Some(own) => self.state(file, own)?,
-                None => 0,
-            };
-            let named = |name: &String| file.zones.iter().position(|zone| zone.name == *name);
-            let zone = entry.zone.as_ref().and_then(named).unwrap_or(0);
             let (to, from) = (self.state(file, &entry.to)?, self.state(file, &entry.from)?);
-            if !filled.insert((zone, own, to, from)) {
+            if !filled.insert((to, from)) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
-            // The neighbour at the centre of the kernel is the cell itself, whose state is `own`. So the centre weights
-            // of other states have no effect.
-            let is_void =
-                |tap| entry.own.is_some() && own != from && tap == (height / 2, width / 2);
-            for (row, col, weight) in self.weights(entry, file.kernel_size)? {
-                if is_void((row, col)) {
-                    continue;
+            for (row, col, weight) in self.weights(entry, size)? {
+                kernel[[to, from, row, col]] = weight;
+            }
+        }
+        Ok(kernel)
+    }
+
+    fn is_odd(&self, what: String, size: [usize; 2]) -> Result<(), ModelError> {
+        if size.iter().all(|side| side % 2 == 1 && *side <= MAX_KERNEL_SIDE) {
+            return Ok(());
+        }
+        let expected = format!("two odd numbers up to {MAX_KERNEL_SIDE}");
+        self.wrong(what, &expected, format!("{size:?}"))
+    }
+
+    /// Returns the transitions of each state.
+    pub fn hazards(&self, file: &ModelFile) -> Result<Hazards, ModelError> {
+        let maps = file.maps.as_ref().map_or(Ok(Maps::new()), |entry| {
+            let unpacked = entry.unpack();
+            unpacked.or_else(|(expected, got)| self.wrong("maps".into(), &expected, got))
+        })?;
+        let shape = self.shape_of(&maps)?;
+        let mut transitions = vec![Vec::new(); file.states.len()];
+        let (mut size, mut used) = ([1, 1], HashSet::new());
+        for entry in &file.transitions {
+            let (from, to) = (self.state(file, &entry.from)?, self.state(file, &entry.to)?);
+            if from == to {
+                return self.wrong(entry.what(), "another state", format!("{:?}", entry.to));
+            }
+            self.probability(entry, "base", entry.base)?;
+            let mut near = Vec::new();
+            for (state, table) in &entry.near {
+                let (of_table, neighbours) = self.near(file, entry, state, table)?;
+                size = [size[0].max(of_table[0]), size[1].max(of_table[1])];
+                near.extend(neighbours);
+            }
+            used.extend(entry.times.iter().map(String::as_str));
+            transitions[from].push(Transition {
+                to,
+                base: hazard(entry.base),
+                near,
+                factors: self.factors(entry, &maps)?,
+            });
+        }
+        if let Some(unused) = maps.keys().find(|name| !used.contains(name.as_str())) {
+            let what = format!("maps: {unused:?}");
+            return self.wrong(what, "a transition that names it in `times`", "none");
+        }
+        Ok(Hazards {
+            size,
+            transitions,
+            maps,
+            shape,
+        })
+    }
+
+    /// Returns the grid of all maps.
+    fn shape_of(&self, maps: &Maps) -> Result<Option<Shape>, ModelError> {
+        let mut shape = None;
+        for (name, map) in maps {
+            let what = || format!("maps: {name:?}");
+            let of_map = match map.shape() {
+                &[height, width] | &[_, _, height, width] => Shape::new(height, width).ok(),
+                _ => None,
+            };
+            if of_map.is_none() || (shape.is_some() && shape != of_map) {
+                let expected = "shape [H, W] or [KH, KW, H, W], with the same grid H x W in all maps";
+                return self.wrong(what(), expected, format!("{:?}", map.shape()));
+            }
+            if let Some(got) = map.iter().find(|factor| !(0.0..=MAX_FACTOR).contains(*factor)) {
+                let expected = format!("factors from 0 to {MAX_FACTOR}");
+                return self.wrong(what(), &expected, got);
+            }
+            shape = of_map;
+        }
+        Ok(shape)
+    }
+
+    /// Returns the product of the maps that a transition names.
+    fn factors(&self, entry: &TransitionEntry, maps: &Maps) -> Result<Factors, ModelError> {
+        let mut factors = Factors::default();
+        for name in &entry.times {
+            let Some(map) = maps.get(name) else {
+                let names: Vec<&String> = maps.keys().collect();
+                let expected = format!("one of the maps {}", shortened(&format!("{names:?}")));
+                return self.wrong(format!("{}: times", entry.what()), &expected, format!("{name:?}"));
+            };
+            let size = [map.shape()[0], map.shape()[1]];
+            let is_of_size = |table: &Vec<Vec<f64>>| [table.len(), table[0].len()] == size;
+            if map.ndim() == 4 && !entry.near.values().all(is_of_size) {
+                let expected = format!("tables `near` of {} x {} cells, as in map {name:?}", size[0], size[1]);
+                return self.wrong(entry.what(), &expected, "another size");
+            }
+            factors.multiply(map);
+        }
+        Ok(factors)
+    }
+
+    fn probability(&self, entry: &TransitionEntry, what: &str, got: f64) -> Result<(), ModelError> {
+        if got == 0.0 || (MIN_PROBABILITY..=1.0).contains(&got) {
+            return Ok(());
+        }
+        let expected = format!("a probability: 0, or {MIN_PROBABILITY:e} to 1");
+        self.wrong(format!("{}: {what}", entry.what()), &expected, got)
+    }
+
+    /// Returns the size of a table, and its neighbours with a hazard.
+    fn near(
+        &self,
+        file: &ModelFile,
+        entry: &TransitionEntry,
+        name: &str,
+        table: &[Vec<f64>],
+    ) -> Result<([usize; 2], Vec<Near>), ModelError> {
+        let (state, part) = (self.state(file, name)?, format!("near.{name}"));
+        let what = || format!("{}: {part}", entry.what());
+        let size = [table.len(), table.first().map_or(0, Vec::len)];
+        self.is_odd(what(), size)?;
+        if let Some(got) = table.iter().map(Vec::len).find(|&length| length != size[1]) {
+            return self.wrong(what(), &format!("rows of {} probabilities", size[1]), got);
+        }
+        let [up, left] = size.map(|side| side / 2);
+        if table[up][left] != 0.0 {
+            let expected = "0 at the centre, because no cell is its own neighbour: use `base`";
+            return self.wrong(what(), expected, table[up][left]);
+        }
+        let mut near = Vec::new();
+        for (row, values) in table.iter().enumerate() {
+            for (col, &probability) in values.iter().enumerate() {
+                self.probability(entry, &part, probability)?;
+                let offset = [row as isize - up as isize, col as isize - left as isize];
+                if probability > 0.0 {
+                    near.push(Near {
+                        state,
+                        offset,
+                        hazard: hazard(probability),
+                    });
                 }
-                kernels[zone * n_own + own][[to, from, row, col]] = weight;
             }
         }
-        Ok(kernels)
-    }
-
-    /// If there are zones, checks that each kernel entry names a zone and that each zone has an entry.
-    fn check_zones(&self, file: &ModelFile) -> Result<(), ModelError> {
-        let names: HashSet<&str> = file.zones.iter().map(|zone| zone.name.as_str()).collect();
-        let mut with_kernel = HashSet::new();
-        for entry in &file.kernel {
-            let zone = entry.zone.as_deref();
-            let fits = zone.map_or(names.is_empty(), |zone| names.contains(zone));
-            if !fits {
-                let expected = if names.is_empty() {
-                    "no zone, because the model has no `zones`"
-                } else {
-                    "the name of one of `zones`"
-                };
-                let got = zone.map_or("none".into(), |zone| format!("{zone:?}"));
-                return self.wrong(format!("{}: zone", entry.what()), expected, got);
-            }
-            with_kernel.extend(zone);
-        }
-        match file
-            .zones
-            .iter()
-            .find(|zone| !with_kernel.contains(&*zone.name))
-        {
-            None => Ok(()),
-            Some(zone) => {
-                let what = format!("zone {:?}", zone.name);
-                self.wrong(what, "kernel entries with its name", "none")
-            }
-        }
-    }
-
-    fn n_own(&self, file: &ModelFile) -> Result<usize, ModelError> {
-        let names_own = |entry: &&KernelEntry| entry.own.is_some();
-        let n_named = file.kernel.iter().filter(names_own).count();
-        if n_named == 0 {
-            return Ok(1);
-        }
-        if n_named < file.kernel.len() {
-            let got = format!("{n_named} of {}", file.kernel.len());
-            return self.wrong("kernel".into(), "own in every entry, or in none", got);
-        }
-        Ok(file.states.len())
+        Ok((size, near))
     }
 
     fn weights(

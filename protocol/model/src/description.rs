@@ -56,8 +56,6 @@ impl Description {
             observed_as: state.observed_as.clone(),
         };
         let stays = |state: &DescribedState| KernelEntry {
-            zone: None,
-            own: None,
             from: state.name.clone(),
             to: state.name.clone(),
             scale: 1.0,
@@ -65,15 +63,15 @@ impl Description {
         };
         Model::new(ModelFile {
             name: self.name.clone(),
-            kernel_size: [1, 1],
+            kernel_size: Some([1, 1]),
             edge: None,
-            zone_map: None,
+            maps: None,
             no_fly: self.no_fly.clone(),
             sensor: self.sensor.clone(),
-            zones: Vec::new(),
             states: self.states.iter().map(state).collect(),
             observations: self.observations.clone(),
             kernel: self.states.iter().map(stays).collect(),
+            transitions: Vec::new(),
         })
     }
 
@@ -89,6 +87,7 @@ impl Description {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Ratio;
     use ndarray::Array4;
 
     const TEXT: &str = r##"
@@ -105,7 +104,7 @@ mod tests {
     fn a_description_makes_a_model_whose_cells_never_change() {
         let model = Description::model_of(TEXT).expect("valid");
         let unchanging = Array4::from_shape_vec((2, 2, 1, 1), vec![1.0, 0.0, 0.0, 1.0]);
-        assert_eq!(Ok(model.kernel()), unchanging.as_ref());
+        assert_eq!(model.ratio().map(Ratio::kernel), unchanging.as_ref().ok());
         assert_eq!(model.reward().to_vec(), [0.0, 2.0]);
         assert_eq!((model.name(), model.target_state()), ("two", 1));
     }

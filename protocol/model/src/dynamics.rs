@@ -1,44 +1,37 @@
-//! The transition of the hidden world: draws each cell of `X_{k+1}` from `Phi(one-hot X_k)` (paper eqs. 2 to 4).
+//! The transition of the hidden world: draws each cell of `X_{k+1}` given `X_k`.
 //!
 //! The result depends only on the model, the seed and the step, not on threads, platform or observers.
 //!
-//! # What is drawn
-//! A *tap* is a position in the kernel, and so an offset from a cell to a neighbour. A neighbour's weights are its
-//! *vote*: with the neighbour at tap `t` in state `n_t`, the weight of next state `m` is `b[m] + sum_t w[m, n_t, t]`
-//! (eq. 2). The cell changes to `m` with a probability proportional to this weight (eqs. 3 and 4). `Tables::weights`
-//! and `Dynamics::sum_kernels` compute exactly this.
-//!
-//! # How it is fast
-//! Two faster methods, which draw from the same distribution, are tried first. `bytes.rs` decides most cells of a row
-//! with one random byte each. For each remaining cell, `parents.rs` then draws one neighbour and this neighbour's vote,
-//! up to eight times. Only cells that are still undecided need the full sum. The wildfire model has hardly any such
-//! cells. A model with too many weights for tables needs the full sum for every cell.
+//! [`ratio`] draws by the paper's rule, and [`hazards`] by that of models of hazards.
 //!
 //! # Random numbers
 //! Two words of the step's ChaCha8 stream are the keys of two SplitMix64 generators, as for sensor noise. One generates
-//! the bytes and the other the random numbers of the draws, band by band. (On a 64 x 64 grid, a step that used only
-//! ChaCha8 spent 2.0 of its 7.1 us on random numbers.)
+//! a byte for each cell, and the other the random numbers of the cells that their bytes do not decide. (On a 64 x 64
+//! grid, a step that used only ChaCha8 spent 2.0 of its 7.1 us on random numbers.)
 
 mod bytes;
+mod hazards;
 mod kernel;
 mod lanes;
 mod mixture;
 mod parents;
 mod places;
+mod ratio;
 
-use super::file::{MAX_VALUES, ModelError};
+use super::file::ModelError;
 use super::grid::{Grid, Shape};
-use super::parameters::Model;
+use super::parameters::{Model, Rule};
 use super::randomness::{Purpose, stream};
 use super::vectors::vectorised;
-use bytes::Bytes;
-use kernel::{Kernel, invert, uniform};
-use lanes::{LANES, Words};
-use mixture::Mixture;
-use parents::Parents;
-use places::{OFF_GRID, Places, centre};
+use kernel::{invert, uniform};
+use lanes::{LANES, high_bits, list_lanes, transposed};
+use places::Places;
 use rand::Rng;
+use std::ops::Range;
 use std::sync::Arc;
+
+/// The keys of a step's generators: for the bytes and for the draws.
+type Keys = [u64; 2];
 
 /// Number of cells in a band, a multiple of [`LANES`]. Each band is finished before the next one begins, so that its
 /// bytes, states and lists stay in a 32 KiB cache.
@@ -49,47 +42,55 @@ const BAND: usize = 8192;
 #[derive(Debug, Clone)]
 pub struct Dynamics {
     shape: Shape,
-    tables: Arc<Tables>,
-    places: Places,
-    /// The undecided cells of a band, each as the index of its home (see `places.rs`).
-    undecided: Vec<u32>,
-    /// Random numbers for the undecided cells.
-    randoms: Vec<u8>,
+    initial: Arc<[f64]>,
+    tables: Tables,
+    buffers: Buffers,
 }
 
-/// The tables computed from the model and the grid, which all worlds share.
-#[derive(Debug)]
-struct Tables {
-    n_states: usize,
-    initial: Vec<f64>,
-    /// The kernels, zone by zone. Each zone has one kernel, or one for each own state (the state of the cell itself).
-    kernels: Vec<Kernel>,
-    /// Number of kernels per zone.
-    n_own: usize,
-    /// The zone of each cell, indexed by home (see `places.rs`), if the model has several zones.
-    zones: Option<Vec<u8>>,
-    /// For each tap, the offset of the neighbour from the cell's home (see `places.rs`).
-    offsets: Vec<usize>,
-    bytes: Bytes,
-    /// `None` if the model has too many weights for tables. Then every cell needs the full sum of eq. 2.
-    parents: Option<Parents>,
+/// The tables of a model and grid, which all worlds share.
+#[derive(Debug, Clone)]
+enum Tables {
+    Ratio(Arc<ratio::Tables>),
+    Hazards(Arc<hazards::Tables>),
+}
+
+#[derive(Debug, Clone)]
+struct Buffers {
+    places: Places,
+    /// One bit per home (see `places.rs`), which is set if a cell of the grid has this home.
+    on_grid: Arc<[u64]>,
+    /// The marked cells of a band, each as the index of its home.
+    listed: Vec<u32>,
+    /// Random numbers for the marked cells.
+    randoms: Vec<u8>,
 }
 
 impl Dynamics {
     /// Makes the tables for a model on a grid.
     ///
     /// # Errors
-    /// [`ModelError::ZeroWeight`] if eq. 3 could divide by zero in some cell ([`Model::check_on`]).
+    /// If a map of the model does not fit the grid, or eq. 3 could divide by zero in some cell ([`Model::check_on`]).
     pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
         model.check_on(shape)?;
         let places = Places::new(model, shape);
+        let n_states = model.n_states();
+        let tables = match model.rule() {
+            Rule::Ratio(it) => Tables::Ratio(ratio::Tables::new(it, &places).into()),
+            Rule::Hazards(it) => {
+                Tables::Hazards(hazards::Tables::new(it, n_states, shape, &places).into())
+            }
+        };
         let in_band = places.next.len().min(BAND);
         Ok(Self {
             shape,
-            tables: Arc::new(Tables::new(model, shape, &places)),
-            places,
-            undecided: vec![0; in_band + LANES],
-            randoms: vec![0; in_band * size_of::<u32>()],
+            initial: model.initial().iter().copied().collect(),
+            tables,
+            buffers: Buffers {
+                on_grid: on_grid(shape, &places).into(),
+                places,
+                listed: vec![0; in_band + LANES],
+                randoms: vec![0; in_band * size_of::<u32>()],
+            },
         })
     }
 
@@ -104,7 +105,7 @@ impl Dynamics {
     pub fn initial(&self, seed: u64) -> Grid<u8> {
         let mut rng = stream(seed, Purpose::Initial, 0);
         Grid::from_shape_simple_fn(self.shape.dim(), || {
-            invert(&self.tables.initial, uniform(rng.next_u64()))
+            invert(&self.initial, uniform(rng.next_u64()))
         })
     }
 
@@ -123,91 +124,58 @@ impl Dynamics {
     }
 
     #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
-    fn advance(&mut self, [byte_key, draw_key]: [u64; 2], cells: &mut [u8]) {
+    fn advance(&mut self, keys: Keys, cells: &mut [u8]) {
         let largest = cells.iter().fold(0, |most, &state| state.max(most));
         assert!(
-            usize::from(largest) < self.tables.n_states,
+            usize::from(largest) < self.initial.len(),
             "states: expected values below S"
         );
-        self.places.load(cells);
-        let tables = Arc::clone(&self.tables);
-        let mut words = Words::new(draw_key);
-        for first in (0..self.places.next.len()).step_by(BAND) {
-            let end = self.places.next.len().min(first + BAND);
-            tables.bytes.decide(&mut self.places, first..end, byte_key);
-            let mut n_undecided =
-                tables
-                    .bytes
-                    .list_undecided(&self.places, first..end, &mut self.undecided);
-            if let Some(parents) = &tables.parents {
-                let undecided = &mut self.undecided[..n_undecided];
-                n_undecided =
-                    parents.decide(&mut self.places, undecided, &mut self.randoms, &mut words);
-            }
-            self.sum_kernels(n_undecided, &mut words);
+        let buffers = &mut self.buffers;
+        buffers.places.load(cells);
+        let n_homes = buffers.places.next.len();
+        let bands = (0..n_homes).step_by(BAND);
+        let bands = bands.map(|first| first..n_homes.min(first + BAND));
+        match &self.tables {
+            Tables::Ratio(tables) => tables.advance(keys, bands, buffers),
+            Tables::Hazards(tables) => tables.advance(keys, bands, buffers),
         }
-        self.places.store(cells);
-    }
-
-    /// Decides the remaining cells with the full sum of eq. 2.
-    fn sum_kernels(&mut self, n_undecided: usize, words: &mut Words) {
-        for &home in &self.undecided[..n_undecided] {
-            let home = home as usize;
-            let weights = self.tables.weights(home, &self.places.states[home..]);
-            let weights = &weights[..self.tables.n_states];
-            self.places.next[home] = invert(weights, uniform(words.draw()));
-        }
+        buffers.places.store(cells);
     }
 }
 
-impl Tables {
-    fn new(model: &Model, shape: Shape, places: &Places) -> Self {
-        let kernels = Kernel::of_model(model);
-        let mixtures = Mixture::of_kernels(&kernels, model.n_zones(), model.sees_own_state());
-        let (offsets, zones) = (places.offsets(model), places.zones(model));
-        let parents = Parents::new(&mixtures, &offsets, zones.as_deref());
-        // Without `parents`, bytes must not decide any cell, because the full sum draws from the whole distribution
-        // instead of the residual one.
-        let by_bytes = if parents.is_some() {
-            &mixtures[..]
-        } else {
-            &[]
-        };
-        Self {
-            n_states: model.n_states(),
-            initial: model.initial().to_vec(),
-            bytes: Bytes::new(by_bytes, &offsets, shape, places.stride, zones.as_deref()),
-            parents,
-            n_own: kernels.len() / model.n_zones(),
-            kernels,
-            zones,
-            offsets,
+impl Buffers {
+    /// Lists the homes of the cells in a band whose next state is a mark, with its high bit set. Returns their number.
+    #[inline(never)] // If it were inlined, LLVM would run out of registers, and a step would take 10 % longer.
+    fn list_marked(&mut self, band: Range<usize>) -> usize {
+        let (chunks, _) = self.places.next[band.clone()].as_chunks();
+        let on_grid = &self.on_grid[band.start / LANES..];
+        let mut n_listed = 0;
+        for ((home, lanes), on_grid) in band.step_by(LANES).zip(chunks).zip(on_grid) {
+            let bits = high_bits(lanes) & on_grid;
+            let to = self.listed[n_listed..]
+                .first_chunk_mut()
+                .expect("invariant: the list is LANES longer than a band");
+            list_lanes(bits, home as u32, to);
+            n_listed += bits.count_ones() as usize;
         }
-    }
-
-    /// Computes eq. 2: the weight of each next state of a cell. `states` is the part of the buffer that begins at the
-    /// cell's home.
-    fn weights(&self, home: usize, states: &[u8]) -> [f64; MAX_VALUES] {
-        let zone = self.zones.as_ref().map_or(0, |zones| zones[home]);
-        let of_zone = &self.kernels[usize::from(zone) * self.n_own..][..self.n_own];
-        let kernel = match of_zone {
-            [kernel] => kernel,
-            by_own_state => &by_own_state[usize::from(states[centre(&self.offsets)])],
-        };
-        let mut sums = [0.0; MAX_VALUES];
-        for (tap, &offset) in self.offsets.iter().enumerate() {
-            let neighbour = states[offset];
-            if neighbour != OFF_GRID {
-                let weights = kernel.weights(tap, usize::from(neighbour));
-                sums.iter_mut().zip(weights).for_each(|(sum, w)| *sum += w);
-            }
-        }
-        sums
+        n_listed
     }
 }
 
-/// Returns the keys of the two generators of a step: for the bytes and for the draws.
-fn keys(seed: u64, n: u64) -> [u64; 2] {
+/// Returns one bit per home, in the order of [`high_bits`], which is set if a cell of the grid has this home.
+fn on_grid(shape: Shape, places: &Places) -> Vec<u64> {
+    let mut bits = vec![0; places.next.len() / LANES];
+    for row in 0..shape.height() {
+        let first = places.home(row, 0);
+        for home in first..first + shape.width() {
+            bits[home / LANES] |= 1_u64 << transposed((home % LANES) as u32);
+        }
+    }
+    bits
+}
+
+/// Returns the keys of a step.
+fn keys(seed: u64, n: u64) -> Keys {
     let mut rng = stream(seed, Purpose::Transition, n);
     [rng.next_u64(), rng.next_u64()]
 }

@@ -2,9 +2,11 @@
 
 use super::cell_map::CellMap;
 use super::grid::{Cell, Shape};
+use super::maps::MapsEntry;
 use crate::text::{parse_problem, read_text, shortened};
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 /// Maximum number of states, and of observations: 64.
@@ -17,8 +19,8 @@ pub const MAX_KERNEL_SIDE: usize = 15;
 /// keep their precision.
 pub(super) const LEAST_SHARE: f64 = 1e-30;
 
-/// Maximum number of zones: the number of values of a byte.
-pub const MAX_ZONES: usize = 256;
+/// Minimum probability of a transition that is not 0: 1e-9.
+pub const MIN_PROBABILITY: f64 = 1e-9;
 
 /// Maximum radius of a sensor: 8 cells.
 pub const MAX_RADIUS: usize = 8;
@@ -29,29 +31,31 @@ pub const MAX_RADIUS: usize = 8;
 pub struct ModelFile {
     /// Name for display.
     pub name: String,
-    /// Number of rows and columns of the transition kernel, both odd.
-    pub kernel_size: [usize; 2],
-    /// Name of the state of all cells outside the grid. Without it, these cells add no weight.
+    /// Number of rows and columns of the transition kernel, both odd. Only for models with `kernel`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub kernel_size: Option<[usize; 2]>,
+    /// Name of the state of all cells outside the grid. Without it, these cells influence no other cell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub edge: Option<String>,
-    /// The zone of each cell, as an index in `zones`.
+    /// Maps that transitions name in `times`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub zone_map: Option<CellMap>,
+    pub maps: Option<MapsEntry>,
     /// No-fly map: 1 for each cell closed to robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<CellMap>,
     /// The sensor of a robot. Without it, a robot sees the cells of its path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<SensorEntry>,
-    /// Kinds of land, each with separate kernels.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub zones: Vec<ZoneEntry>,
     /// The states, in the order of their values.
     pub states: Vec<StateEntry>,
     /// The observations, in the order of their values.
     pub observations: Vec<ObservationEntry>,
-    /// The nonzero blocks `w[to, from]` of the kernels.
+    /// The nonzero blocks `w[to, from]` of the kernel of eq. 2. A model has either these or `transitions`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub kernel: Vec<KernelEntry>,
+    /// The transitions of a model of hazards. Those of each state are in order: the first that happens wins.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub transitions: Vec<TransitionEntry>,
 }
 
 /// One state of a model file.
@@ -93,26 +97,10 @@ pub struct SensorEntry {
     pub radius: usize,
 }
 
-/// A kind of land in a model file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ZoneEntry {
-    /// Name, unique among the zones.
-    pub name: String,
-    /// Colour in pictures, `#rrggbb`.
-    pub color: String,
-}
-
 /// One block `w[to, from]` of a kernel in a model file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KernelEntry {
-    /// Name of the zone. Either every entry of a file names a zone, or none does.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub zone: Option<String>,
-    /// Name of the cell's own state at step k. Either every entry of a file has it, or none does.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub own: Option<String>,
     /// Name of the neighbour's state at step k.
     pub from: String,
     /// Name of the cell's state at step k + 1.
@@ -122,6 +110,30 @@ pub struct KernelEntry {
     pub scale: f64,
     /// Weights `[row offset][column offset]`. The centre is the cell itself, and rows grow downward.
     pub weights: Vec<Vec<f64>>,
+}
+
+/// One transition of a model of hazards: the ways in which a cell changes from one state to another.
+///
+/// The transition happens in a step with probability `1 - (1 - base) prod (1 - p)`. The product is over all neighbours,
+/// and `p` is the entry of `near` for the neighbour's state and place.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TransitionEntry {
+    /// Name of the cell's state at step k.
+    pub from: String,
+    /// Name of the cell's state at step k + 1.
+    pub to: String,
+    /// Probability without any influence of neighbours.
+    #[serde(default)]
+    pub base: f64,
+    /// Names of the maps that multiply `-log(1 - p)` of the probabilities. A map `[H, W]` multiplies those of `base` and
+    /// `near`; a map `[KH, KW, H, W]` those of `near`, each place of a neighbour by its own factors.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub times: Vec<String>,
+    /// For names of states, the probability `p` with which one neighbour in that state causes the transition, as
+    /// `[row offset][column offset]`. The centre is the cell itself and has 0, and rows grow downward.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub near: BTreeMap<String, Vec<Vec<f64>>>,
 }
 
 /// The reason for rejecting a model file.
@@ -170,9 +182,9 @@ pub enum ModelError {
         /// The system's error.
         problem: String,
     },
-    /// A kernel entry names an unknown state.
+    /// A kernel entry or a transition names an unknown state.
     #[error(
-        "model {:?}: kernel entry names state {:?}, expected one of {}",
+        "model {:?}: an entry names state {:?}, expected one of {}",
         shortened(model),
         shortened(name),
         shortened(&format!("{known:?}"))
@@ -180,7 +192,7 @@ pub enum ModelError {
     UnknownState {
         /// The model's name.
         model: String,
-        /// The name in the kernel entry.
+        /// The name in the entry.
         name: String,
         /// The model's states.
         known: Vec<String>,
@@ -233,16 +245,30 @@ pub enum ModelError {
     },
 }
 
+/// Advice about a file with kernels by own state or by zone, which earlier releases had.
+const HAZARDS: &str = r#"kernels by own state and zones are now transitions, with a map for what differs between cells:
+
+    maps = "land.npz"        # arrays [H, W] or [KH, KW, H, W]
+
+    [[transitions]]
+    from = "unburnt"
+    to = "burning"
+    base = 0.00004           # probability a step
+    near.burning = [[0.05, 0.03, 0.01], [0.08, 0.0, 0.01], [0.05, 0.03, 0.01]]    # by one neighbour
+    times = ["fuel"]
+"#;
+
 impl From<toml::de::Error> for ModelError {
     /// Adds advice if the text contains a key of earlier releases.
     fn from(error: toml::de::Error) -> Self {
         let mut text = parse_problem(&error) + "\n";
-        if ["`rings`", "`pays`"]
-            .iter()
-            .any(|key| error.message().contains(key))
-        {
+        let has = |keys: &[&str]| keys.iter().any(|key| error.message().contains(&format!("field `{key}`")));
+        if has(&["rings", "pays"]) {
             text += "remove `rings` and `pays`: a sensor has one observation matrix, and rewards are for \
                      visited cells\n";
+        }
+        if has(&["own", "zone", "zones", "zone_map"]) {
+            text += HAZARDS;
         }
         Self::Toml(text)
     }
@@ -260,9 +286,12 @@ impl ModelFile {
         };
         let text = read_text(path).map_err(|error| failed(path, error.to_string()))?;
         let mut file: Self = toml::from_str(&text)?;
-        for map in [&mut file.zone_map, &mut file.no_fly].into_iter().flatten() {
-            let read = map.read_beside(path);
-            read.map_err(|(path, problem)| failed(&path, problem))?;
+        let failed = |(path, problem): (PathBuf, String)| failed(&path, problem);
+        if let Some(map) = &mut file.no_fly {
+            map.read_beside(path).map_err(failed)?;
+        }
+        if let Some(maps) = &mut file.maps {
+            maps.read_beside(path).map_err(failed)?;
         }
         Ok(file)
     }
@@ -271,13 +300,14 @@ impl ModelFile {
 impl KernelEntry {
     /// Returns the name of the entry for errors.
     pub(super) fn what(&self) -> String {
-        let pair = format!("from {:?} to {:?}", self.from, self.to);
-        let zone = self.zone.iter().map(|zone| format!("in zone {zone:?} "));
-        let zone: String = zone.collect();
-        match &self.own {
-            Some(own) => format!("kernel {zone}of {own:?} {pair}"),
-            None => format!("kernel {zone}{pair}"),
-        }
+        format!("kernel from {:?} to {:?}", self.from, self.to)
+    }
+}
+
+impl TransitionEntry {
+    /// Returns the name of the entry for errors.
+    pub(super) fn what(&self) -> String {
+        format!("transition from {:?} to {:?}", self.from, self.to)
     }
 }
 

@@ -14,6 +14,9 @@ pub mod dynamics;
 pub mod file;
 pub mod frame;
 pub mod grid;
+pub mod hazards;
+pub mod maps;
+mod npy;
 mod parameters;
 mod parts;
 pub mod path;
@@ -22,19 +25,20 @@ pub mod task;
 pub mod text;
 pub mod transition;
 pub mod vectors;
-pub mod zoned;
 
 pub use airspace::Airspace;
 pub use cell_map::CellMap;
 pub use description::{DescribedState, Description};
 pub use dynamics::Dynamics;
 pub use file::{
-    KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES, ModelError, ModelFile,
-    ObservationEntry, SensorEntry, StateEntry, ZoneEntry, parse_color,
+    KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, ModelError, ModelFile, ObservationEntry,
+    SensorEntry, StateEntry, TransitionEntry, parse_color,
 };
 pub use frame::{Coverage, Frame, UNOBSERVED};
 pub use grid::{Cell, Grid, Probabilities, Shape};
-pub use parameters::Model;
+pub use hazards::Hazards;
+pub use maps::MapsEntry;
+pub use parameters::{Model, Ratio, Rule};
 pub use parts::Parts;
 pub use path::Move;
 pub use transition::Transition;

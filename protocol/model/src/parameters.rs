@@ -9,21 +9,36 @@ use super::built_in::MODELS;
 use super::check::Checker;
 use super::file::{LEAST_SHARE, ModelError, ModelFile, SensorEntry};
 use super::grid::{Cell, Grid, Shape};
+use super::hazards::Hazards;
 use ndarray::{Array1, Array2, Array4, Axis};
 use std::path::Path;
 use std::sync::Arc;
+
+/// How the next state of a cell depends on its neighbourhood.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Rule {
+    /// The paper's rule (eqs. 2 and 3): weights of the neighbours, divided by their sum.
+    Ratio(Ratio),
+    /// Each neighbour causes transitions independently of the others.
+    Hazards(Arc<Hazards>),
+}
+
+/// The parameters of eq. 2.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ratio {
+    kernel: Array4<f64>,
+    bias: Array1<f64>,
+}
 
 /// A checked model. Every value of this type is valid for simulation and filtering.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     file: ModelFile,
-    kernels: Vec<Array4<f64>>,
-    bias: Array1<f64>,
+    rule: Rule,
     likelihood: Array2<f64>,
     initial: Array1<f64>,
     reward: Array1<f64>,
     edge: Option<usize>,
-    zone_map: Option<Arc<Grid<u8>>>,
     /// For each cell, whether it is closed to robots.
     no_fly: Option<Arc<Grid<bool>>>,
 }
@@ -86,24 +101,26 @@ impl Model {
     pub fn new(file: ModelFile) -> Result<Self, ModelError> {
         let check = Checker { model: &file.name };
         check.counts_and_names(&file)?;
-        let kernels = check.kernels(&file)?;
         let bias = check.per_state(&file, "bias", |state| state.bias, 0.0)?;
+        let rule = if check.is_of_hazards(&file)? {
+            Rule::Hazards(Arc::new(check.hazards(&file)?))
+        } else {
+            let kernel = check.kernel(&file)?;
+            Rule::Ratio(Ratio { kernel, bias })
+        };
         let reward = check.per_state(&file, "reward", |state| state.reward, f64::NEG_INFINITY)?;
         let initial = check.per_state(&file, "initial", |state| state.initial, 0.0)?;
         check.distribution("initial", initial.as_slice().unwrap_or_default())?;
         check.radius(&file)?;
         let likelihood = check.likelihood(&file)?;
         let initial = &initial / initial.sum();
-        let zone_map = check.zone_map(&file)?.map(Arc::new);
         let no_fly = check.no_fly(&file)?.map(Arc::new);
         let edge = check.edge(&file)?;
         Ok(Self {
             edge,
-            zone_map,
             no_fly,
             file,
-            kernels,
-            bias,
+            rule,
             likelihood,
             initial,
             reward,
@@ -116,11 +133,9 @@ impl Model {
     /// If a map does not fit the grid, or if the weights of a cell can sum to nearly zero. The error names the first
     /// such cell.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
-        let maps = [
-            ("zone_map", self.zone_map.as_ref().map(|map| map.dim())),
-            ("no_fly", self.no_fly.as_ref().map(|map| map.dim())),
-        ];
-        for (what, dim) in maps {
+        let no_fly = self.no_fly.as_ref().map(|map| map.dim());
+        let maps = self.hazards().and_then(Hazards::shape).map(Shape::dim);
+        for (what, dim) in [("maps", maps), ("no_fly", no_fly)] {
             if let Some((height, width)) = dim.filter(|&dim| dim != shape.dim()) {
                 return Err(ModelError::Value {
                     model: self.name().into(),
@@ -130,25 +145,19 @@ impl Model {
                 });
             }
         }
-        (0..self.kernels.len()).try_for_each(|kernel| self.check_kernel_on(kernel, shape))
+        match &self.rule {
+            Rule::Ratio(ratio) => self.check_ratio_on(ratio, shape),
+            Rule::Hazards(_) => Ok(()),
+        }
     }
 
-    fn check_kernel_on(&self, index: usize, shape: Shape) -> Result<(), ModelError> {
-        let (kernel, own) = (&self.kernels[index], index % self.n_own());
+    fn check_ratio_on(&self, ratio: &Ratio, shape: Shape) -> Result<(), ModelError> {
+        let Ratio { kernel, bias } = ratio;
         let column_sums = kernel.sum_axis(Axis(0));
-        let mut least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
+        let least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
         let (kernel_height, kernel_width) = least.dim();
-        if self.sees_own_state() {
-            let (row, col) = (kernel_height / 2, kernel_width / 2);
-            least[[row, col]] = column_sums[[own, row, col]];
-        }
-        // The largest weight of all zones, because all zones are scaled by the same factor.
-        let in_zones = self.kernels.iter().skip(own).step_by(self.n_own());
-        let largest = in_zones
-            .flatten()
-            .chain(&self.bias)
-            .copied()
-            .fold(f64::MIN_POSITIVE, f64::max);
+        let numbers = kernel.iter().chain(bias);
+        let largest = numbers.copied().fold(f64::MIN_POSITIVE, f64::max);
         // All cells further than a kernel from the edges have the same weights, so checking one such row and column is
         // enough.
         let distinct = |side: usize, kernel: usize| {
@@ -167,7 +176,7 @@ impl Model {
                         None => 0.0,
                     }
                 });
-                let sum = self.bias.sum() + weights.sum::<f64>();
+                let sum = bias.sum() + weights.sum::<f64>();
                 self.check_share(sum / largest, shape, Cell { row, col })?;
             }
         }
@@ -218,24 +227,36 @@ impl Model {
         observations.map(|it| it.name.clone()).collect()
     }
 
-    /// Returns whether a cell's weights depend on its own state.
-    pub fn sees_own_state(&self) -> bool {
-        self.n_own() > 1
+    /// Returns how states change.
+    pub fn rule(&self) -> &Rule {
+        &self.rule
     }
 
-    /// Returns the number of kernels per zone: 1, or the number of own states.
-    fn n_own(&self) -> usize {
-        self.kernels.len() / self.n_zones()
+    /// Returns the parameters of eq. 2, or `None` if this is a model of hazards.
+    pub fn ratio(&self) -> Option<&Ratio> {
+        match &self.rule {
+            Rule::Ratio(ratio) => Some(ratio),
+            Rule::Hazards(_) => None,
+        }
     }
 
-    /// Returns the number of zones, 1 without a zone map.
-    pub fn n_zones(&self) -> usize {
-        self.file.zones.len().max(1)
+    /// Returns the transitions, or `None` if the model has the paper's rule.
+    pub fn hazards(&self) -> Option<&Hazards> {
+        match &self.rule {
+            Rule::Ratio(_) => None,
+            Rule::Hazards(hazards) => Some(hazards),
+        }
     }
 
-    /// Returns the zone of each cell, shape `[H, W]`, if the model has zones.
-    pub fn zone_map(&self) -> Option<&Arc<Grid<u8>>> {
-        self.zone_map.as_ref()
+    /// Returns the number of rows and columns of the neighbourhood that influences a cell, both odd.
+    pub fn kernel_size(&self) -> [usize; 2] {
+        match &self.rule {
+            Rule::Ratio(ratio) => {
+                let (_, _, height, width) = ratio.kernel.dim();
+                [height, width]
+            }
+            Rule::Hazards(hazards) => hazards.size(),
+        }
     }
 
     /// Returns the cells where robots may fly, and the cells that they see from there.
@@ -252,25 +273,8 @@ impl Model {
         self.file.sensor.as_ref().map_or(0, |sensor| sensor.radius)
     }
 
-    /// Returns the kernels `w[to, from, row, col]`, each of shape `[S, S, KH, KW]`. All weights are `>= 0` (eq. 2).
-    ///
-    /// Each zone has one kernel, or one for each own state (the state of the cell itself). The kernels of a zone are
-    /// stored contiguously.
-    pub fn kernels(&self) -> &[Array4<f64>] {
-        &self.kernels
-    }
-
-    /// Returns the first of [`Model::kernels`]. It is the only one unless the model has zones or own-state kernels.
-    pub fn kernel(&self) -> &Array4<f64> {
-        &self.kernels[0]
-    }
-
-    /// Returns the transition biases `b[to]`, shape `[S]`. All are `>= 0` (eq. 2).
-    pub fn bias(&self) -> &Array1<f64> {
-        &self.bias
-    }
-
-    /// Returns the state of all cells outside the grid. If it is `None`, these cells add no weight.
+    /// Returns the state of all cells outside the grid. If it is `None`, these cells influence no
+    /// other cell.
     pub fn edge(&self) -> Option<usize> {
         self.edge
     }
@@ -312,5 +316,17 @@ impl Model {
     /// Finds a state by its name.
     pub fn state_named(&self, name: &str) -> Option<usize> {
         self.file.states.iter().position(|state| state.name == name)
+    }
+}
+
+impl Ratio {
+    /// Returns the kernel `w[to, from, row, col]`, shape `[S, S, KH, KW]`. All weights are `>= 0` (eq. 2).
+    pub fn kernel(&self) -> &Array4<f64> {
+        &self.kernel
+    }
+
+    /// Returns the transition biases `b[to]`, shape `[S]`. All are `>= 0` (eq. 2).
+    pub fn bias(&self) -> &Array1<f64> {
+        &self.bias
     }
 }

@@ -5,12 +5,6 @@
 //! `edge` state and 0 otherwise. Eq. 3 divides `phi` by its sum over `m`. [`super::dynamics`] draws states from the
 //! same operator.
 //!
-//! If the kernels depend on the cell's own state `o`, `phi[m | o]` has the weights of `o`, and the cell at the centre
-//! of the kernel is in state `o`. Then `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean-field
-//! approximation: it assumes that the cell and its neighbours are independent, as the filter does.
-//!
-//! If the model has zones, each cell has the weights of its zone.
-//!
 //! `tests/model/models.rs` computes these sums directly, and `tests/model/transition.rs` compares the results for
 //! random models and grids.
 //!
@@ -22,102 +16,58 @@
 mod layout;
 mod rows;
 
-use super::file::ModelError;
-use super::grid::{Grid, Shape};
-use super::parameters::Model;
+use super::grid::{Probabilities, Shape};
 use super::vectors::{LANES, vectorised};
-use super::zoned::ZonedNumbers;
 use layout::Layout;
-use ndarray::{Array3, Array4, NdFloat};
-use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
-use std::sync::Arc;
+use ndarray::Array4;
+use rows::{Row, kernel_rows, taps_that_weigh_alike};
 
-/// The operator `Phi` for one model on one grid, with its buffers. Each thread needs its own clone.
-///
-/// The programs use `f32`; tests also use `f64`.
+/// One value for each cell of a chunk: [`LANES`] consecutive cells of a row.
+type Lanes = [f32; LANES];
+
+/// The operator `Phi` for one kernel on one grid, with its buffers. Each thread needs its own clone.
 #[derive(Debug, Clone)]
-pub struct Transition<T = f32> {
+pub struct Transition {
     shape: Shape,
     n_states: usize,
     layout: Layout,
     /// Groups of taps with equal weights. Each tap is stored as an offset from a cell's place in `planes`.
     groups: Vec<Vec<usize>>,
-    kernels: Kernels<T>,
-    /// The weights that differ between zones.
-    slots: Arc<ZonedNumbers<T>>,
+    rows: Vec<Row>,
     /// The belief, one plane per state. Margins are 1 in the plane of the model's edge state, and 0 in the other
     /// planes.
-    planes: Vec<T>,
+    planes: Vec<f32>,
     /// The sum of the beliefs at the taps of each group.
-    sums: Vec<[T; LANES]>,
+    sums: Vec<Lanes>,
     /// The weight of each next state, before the division of eq. 3.
-    weights: Vec<[T; LANES]>,
-    /// The weight of each next state given one own state.
-    own_weights: Vec<[T; LANES]>,
+    weights: Vec<Lanes>,
 }
 
-impl<T: NdFloat> Transition<T> {
-    /// Prepares a model's operator for a grid.
+impl Transition {
+    /// Prepares the operator for a grid from weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd `KH` and `KW`, and
+    /// biases `b[m]`. `edge` is the state of all cells outside the grid; without it, these cells add no weight.
     ///
-    /// # Errors
-    /// [`ModelError::ZeroWeight`] if eq. 3 could divide by zero in some cell ([`Model::check_on`]).
-    pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
-        model.check_on(shape)?;
-        let bias = model.bias().to_vec();
-        let land = (model.zone_map().map(|map| &**map), model.n_zones());
-        let mut transition = Self::on_land(model.kernels(), &bias, shape, land);
-        if let Some(edge) = model.edge() {
-            // `load` replaces the values inside the margins.
-            let planes = &mut transition.planes;
-            planes[edge * transition.layout.plane..][..transition.layout.plane].fill(T::one());
-        }
-        Ok(transition)
-    }
-
-    /// Prepares the operator for a grid from weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd `KH` and `KW`,
-    /// and biases `b[m]`.
-    ///
-    /// `kernels` contains one kernel, or one for each own state (the state of the cell itself). All weights must be
-    /// finite and 0 or more. If all weights of a cell are 0, its prediction is NaN.
-    pub fn of_weights(kernels: &[Array4<f64>], bias: &[f64], shape: Shape) -> Self {
-        Self::on_land(kernels, bias, shape, (None, 1))
-    }
-
-    /// Prepares the operator as [`Self::of_weights`] does, but with kernels for each zone. The map contains the zone of
-    /// each cell, shape `[H, W]`.
-    fn on_land(
-        kernels: &[Array4<f64>],
-        bias: &[f64],
-        shape: Shape,
-        (zones, n_zones): (Option<&Grid<u8>>, usize),
-    ) -> Self {
-        let (n_states, _, kernel_height, kernel_width) = kernels[0].dim();
-        let layout = Layout::new(shape, kernel_height, kernel_width);
-        let n_own = kernels.len() / n_zones;
-        let (columns, groups): (Vec<_>, Vec<_>) = taps_that_weigh_alike(kernels, n_own > 1, layout)
+    /// All weights must be finite and 0 or more. If all weights of a cell are 0, its prediction is NaN.
+    pub fn new(kernel: &Array4<f64>, bias: &[f64], edge: Option<usize>, shape: Shape) -> Self {
+        let (n_states, _, height, width) = kernel.dim();
+        let layout = Layout::new(shape, height, width);
+        let (columns, groups): (Vec<_>, Vec<_>) = taps_that_weigh_alike(kernel, layout)
             .into_iter()
             .unzip();
-        let mut slots = Vec::new();
-        let mut rows = |own: usize| {
-            let of_zones: Vec<_> = kernels.iter().skip(own).step_by(n_own).collect();
-            kernel_rows(own, &of_zones, bias, n_own, &columns, &mut slots)
-        };
-        let kernels = if n_own > 1 {
-            Kernels::Own((0..n_states).map(|own| Own::new(rows(own))).collect())
-        } else {
-            Kernels::Alike(rows(0))
-        };
+        let mut planes = vec![0.0; n_states * layout.plane];
+        if let Some(edge) = edge {
+            // `load` replaces the values inside the margins.
+            planes[edge * layout.plane..][..layout.plane].fill(1.0);
+        }
         Self {
             shape,
             n_states,
             layout,
-            planes: vec![T::zero(); n_states * layout.plane],
-            sums: vec![[T::zero(); LANES]; groups.len()],
-            weights: vec![[T::zero(); LANES]; n_states],
-            own_weights: vec![[T::zero(); LANES]; n_states],
+            planes,
+            sums: vec![[0.0; LANES]; groups.len()],
+            weights: vec![[0.0; LANES]; n_states],
             groups,
-            kernels,
-            slots: Arc::new(ZonedNumbers::new(&slots, zones)),
+            rows: kernel_rows(kernel, bias, &columns),
         }
     }
 
@@ -126,7 +76,7 @@ impl<T: NdFloat> Transition<T> {
     ///
     /// # Panics
     /// If an array has a different shape or is not row-major.
-    pub fn apply(&mut self, belief: &Array3<T>, out: &mut Array3<T>) {
+    pub fn apply(&mut self, belief: &Probabilities, out: &mut Probabilities) {
         let dim = (self.n_states, self.shape.height(), self.shape.width());
         assert_eq!(belief.dim(), dim, "belief: expected [S, H, W]");
         assert_eq!(out.dim(), dim, "predictor: expected [S, H, W]");
@@ -135,12 +85,10 @@ impl<T: NdFloat> Transition<T> {
         vectorised(
             #[inline(always)]
             || {
-                let mut chunk = 0;
                 for row in 0..self.shape.height() {
                     for col in (0..self.shape.width()).step_by(LANES) {
-                        self.weigh(row * self.layout.stride + col, chunk);
+                        self.weigh(row * self.layout.stride + col);
                         self.store(row, col, out);
-                        chunk += 1;
                     }
                 }
             },
@@ -148,7 +96,7 @@ impl<T: NdFloat> Transition<T> {
     }
 
     /// Copies the belief into the planes, inside the margins.
-    fn load(&mut self, belief: &[T]) {
+    fn load(&mut self, belief: &[f32]) {
         let (Layout { above, left, .. }, width) = (self.layout, self.shape.width());
         let states = belief.chunks_exact(self.shape.n_cells());
         for (cells, plane) in states.zip(self.planes.chunks_exact_mut(self.layout.plane)) {
@@ -161,39 +109,25 @@ impl<T: NdFloat> Transition<T> {
 
     /// Computes eq. 2 for the [`LANES`] cells of a chunk that begins at place `at`.
     #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
-    fn weigh(&mut self, at: usize, chunk: usize) {
-        let slots = self.slots.of_chunk(chunk);
+    fn weigh(&mut self, at: usize) {
         for (sum, offsets) in self.sums.iter_mut().zip(&self.groups) {
             *sum = add_up(&self.planes[at..], offsets);
         }
-        match &self.kernels {
-            Kernels::Alike(rows) => {
-                for (weight, row) in self.weights.iter_mut().zip(rows) {
-                    *weight = row.weigh(&self.sums, slots);
-                }
-            }
-            Kernels::Own(kernels) => {
-                self.weights.fill([T::zero(); LANES]);
-                let centre = at + self.layout.above * self.layout.stride + self.layout.left;
-                for (plane, own) in self.planes.chunks_exact(self.layout.plane).zip(kernels) {
-                    let p = lanes_from(plane, centre);
-                    let sums = (&self.sums[..], slots);
-                    own.add(p, sums, &mut self.own_weights, &mut self.weights);
-                }
-            }
+        for (weight, row) in self.weights.iter_mut().zip(&self.rows) {
+            *weight = row.weigh(&self.sums);
         }
     }
 
     /// Computes eq. 3 for the cells of a chunk that begins at `(row, col)`, up to the edge of the grid.
     #[inline(always)]
-    fn store(&self, row: usize, col: usize, out: &mut [T]) {
-        let mut total = [T::zero(); LANES];
+    fn store(&self, row: usize, col: usize, out: &mut [f32]) {
+        let mut total = [0.0; LANES];
         for weight in &self.weights {
             for (total, &weight) in total.iter_mut().zip(weight) {
                 *total += weight;
             }
         }
-        let factor = total.map(|total| T::one() / total);
+        let factor = total.map(|total| 1.0 / total);
         let width = self.shape.width();
         for (weight, plane) in self
             .weights
@@ -214,15 +148,14 @@ impl<T: NdFloat> Transition<T> {
 
     /// Returns the approximate memory in bytes: the belief with margins, and the buffers.
     pub fn memory_bytes(&self) -> usize {
-        let n_lanes = self.sums.len() + self.weights.len() + self.own_weights.len();
-        let work = n_lanes * size_of::<[T; LANES]>();
-        size_of_val(&*self.planes) + work + self.slots.memory_bytes()
+        let n_lanes = self.sums.len() + self.weights.len();
+        size_of_val(&*self.planes) + n_lanes * size_of::<Lanes>()
     }
 }
 
 /// Returns the [`LANES`] values that begin at a place.
 #[inline(always)]
-fn lanes_from<T>(planes: &[T], at: usize) -> &[T; LANES] {
+fn lanes_from(planes: &[f32], at: usize) -> &Lanes {
     planes[at..]
         .first_chunk()
         .expect("invariant: the layout has LANES cells from every tap on")
@@ -230,8 +163,8 @@ fn lanes_from<T>(planes: &[T], at: usize) -> &[T; LANES] {
 
 /// Returns the sum of the [`LANES`] values at several offsets.
 #[inline(always)]
-fn add_up<T: NdFloat>(planes: &[T], offsets: &[usize]) -> [T; LANES] {
-    let mut sum = [T::zero(); LANES];
+fn add_up(planes: &[f32], offsets: &[usize]) -> Lanes {
+    let mut sum = [0.0; LANES];
     for &offset in offsets {
         for (sum, &lane) in sum.iter_mut().zip(lanes_from(planes, offset)) {
             *sum += lane;

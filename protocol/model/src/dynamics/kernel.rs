@@ -1,31 +1,20 @@
 //! The weights of paper eq. 2 for each tap (kernel position), and the draw of a state in proportion to weights.
 
-use super::super::parameters::Model;
-use ndarray::Array4;
+use super::super::parameters::Ratio;
 
-/// The weights of eq. 2, either for all cells or only for cells in one particular own state.
+/// The weights of eq. 2.
 #[derive(Debug, Clone)]
 pub(super) struct Kernel {
     pub(super) n_states: usize,
     pub(super) n_taps: usize,
     /// `w[m, n, t]` as `[tap][from][to]`. The centre tap includes the bias, because its neighbour is the cell itself,
-    /// which always exists. In a kernel for one own state, the centre tap has the weights of that state for every
-    /// `from`.
+    /// which always exists.
     pub(super) weights: Vec<f64>,
 }
 
 impl Kernel {
-    /// Returns the kernels of a model, zone by zone: for each zone either one kernel, or one for each own state.
-    pub(super) fn of_model(model: &Model) -> Vec<Self> {
-        let bias = model.bias().to_vec();
-        let own = |index| (model.sees_own_state()).then_some(index % model.n_states());
-        let kernels = model.kernels().iter().enumerate();
-        kernels
-            .map(|(index, kernel)| Self::new(kernel, &bias, own(index)))
-            .collect()
-    }
-
-    fn new(kernel: &Array4<f64>, bias: &[f64], own: Option<usize>) -> Self {
+    pub(super) fn new(ratio: &Ratio) -> Self {
+        let (kernel, bias) = (ratio.kernel(), ratio.bias());
         let (n_states, _, kernel_height, kernel_width) = kernel.dim();
         let n_taps = kernel_height * kernel_width;
         // A common factor cancels in eq. 3. Dividing by the largest weight keeps sums of weights from overflowing.
@@ -33,11 +22,9 @@ impl Kernel {
         let mut weights = Vec::with_capacity(n_taps * n_states * n_states);
         for tap in 0..n_taps {
             let (row, col) = (tap / kernel_width, tap % kernel_width);
-            let is_centre = tap == n_taps / 2;
-            for neighbour in 0..n_states {
-                let from = own.filter(|_| is_centre).unwrap_or(neighbour);
+            for from in 0..n_states {
                 weights.extend((0..n_states).map(|to| {
-                    let bias = if is_centre { bias[to] } else { 0.0 };
+                    let bias = if tap == n_taps / 2 { bias[to] } else { 0.0 };
                     (kernel[[to, from, row, col]] + bias) / largest
                 }));
             }

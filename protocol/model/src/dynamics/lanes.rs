@@ -1,4 +1,4 @@
-//! The vectorised loops of [`super::bytes`], over [`LANES`] cells at once.
+//! Vectorised loops over [`LANES`] cells at once.
 //!
 //! These are plain loops over arrays. They are inlined, so that LLVM compiles them for the same vector instructions as
 //! their caller.
@@ -16,54 +16,20 @@ const ESCAPED: u8 = 254;
 #[derive(Debug)]
 pub(super) struct FastTap {
     offset: usize,
-    /// For each lane, the last byte value that stands for this tap. The tap's first value follows the last value of the
-    /// previous tap. If bounds differ between lanes, each is instead the first value after the tap's values, so that
-    /// the tap can have no values in some lanes.
-    bound: [u8; LANES],
+    /// The last byte value that stands for this tap. The tap's first value follows the last value of the previous tap.
+    bound: u8,
 }
 
-/// The meaning of byte values in cells with one own state. The lowest values stand for the centre tap, and the next
-/// ones for the other taps.
-#[derive(Debug)]
-pub(super) struct FastOwn {
-    pub(super) own: u8,
-    /// The next state to which the cell itself gives the most weight.
-    pub(super) likeliest: u8,
-    /// The bound of the centre tap's byte values, as in [`FastTap`]. `None` if the tap has no values in any lane.
-    pub(super) bound: Option<[u8; LANES]>,
-    pub(super) neighbours: Vec<FastTap>,
-    /// The pairs `(n, f(n))` of neighbour states `n` for which `f(n)` differs from `n`.
-    pub(super) changes: Vec<(u8, u8)>,
-}
-
-/// Returns the taps that the byte values from `first` upward stand for. For each tap, `taps` contains the number of
-/// values in each lane and the offset. `DIFFER` is set if these numbers differ between lanes.
-pub(super) fn fast_taps<const DIFFER: bool>(
-    first: [usize; LANES],
-    taps: impl Iterator<Item = ([usize; LANES], usize)>,
-) -> Vec<FastTap> {
-    let mut end = first;
+/// Returns the taps that byte values stand for. For each tap, `taps` contains the number of values and the offset.
+pub(super) fn fast_taps(taps: impl Iterator<Item = (usize, usize)>) -> Vec<FastTap> {
+    let mut end = 0;
     let mut fast = Vec::new();
-    for (counts, offset) in taps {
-        end.iter_mut().zip(counts).for_each(|(end, n)| *end += n);
-        if counts.iter().any(|&n| n > 0) {
-            let bound = bounds::<DIFFER>(end);
-            fast.push(FastTap { offset, bound });
-        }
+    for (count, offset) in taps.filter(|(count, _)| *count > 0) {
+        end += count;
+        let bound = u8::try_from(end - 1).expect("invariant: fast probabilities sum to <= 1");
+        fast.push(FastTap { offset, bound });
     }
     fast
-}
-
-/// Converts the exclusive ends of a tap's byte values to bounds (see [`FastTap`]).
-pub(super) fn bounds<const DIFFER: bool>(end: [usize; LANES]) -> [u8; LANES] {
-    let bound = |end: usize| if DIFFER { end } else { end - 1 };
-    end.map(|end| u8::try_from(bound(end)).expect("invariant: fast probabilities sum to <= 1"))
-}
-
-/// Returns whether a byte is within a bound.
-#[inline(always)]
-fn is_within<const DIFFER: bool>(byte: u8, bound: u8) -> bool {
-    if DIFFER { byte < bound } else { byte <= bound }
 }
 
 /// Fills `bytes` with the outputs of the SplitMix64 generator of a key, starting at output `first`. `bytes` must
@@ -102,63 +68,26 @@ impl Words {
 
 /// Replaces each byte with the state of the neighbour at the tap that the byte stands for, or with [`ESCAPED`].
 #[inline(always)]
-pub(super) fn blend<const DIFFER: bool>(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
+pub(super) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     let mut states = [ESCAPED; LANES];
     // A byte within the bound of its tap is also within the bounds of all later taps. So the loop runs backwards, and
     // each tap overwrites the results of later taps.
     for tap in fast.iter().rev() {
-        let parent: &[u8; LANES] = parents[tap.offset..]
-            .first_chunk()
-            .expect("invariant: every tap reads a whole chunk of places");
+        let parent = lanes_from(parents, tap.offset);
         for lane in 0..LANES {
             // Arithmetic instead of an `if`, because LLVM vectorises it.
-            let is_chosen = is_within::<DIFFER>(lanes[lane], tap.bound[lane]);
-            let chosen = u8::from(is_chosen).wrapping_neg();
+            let chosen = u8::from(lanes[lane] <= tap.bound).wrapping_neg();
             states[lane] ^= (states[lane] ^ parent[lane]) & chosen;
         }
     }
     *lanes = states;
 }
 
-/// Replaces bytes as [`blend`] does, but with the table of each cell's own state. `centre` is the offset of the cell
-/// from its home.
+/// Returns the [`LANES`] states that begin at a place.
 #[inline(always)]
-pub(super) fn blend_own<const DIFFER: bool>(
-    lanes: &mut [u8; LANES],
-    fast: &[FastOwn],
-    parents: &[u8],
-    centre: usize,
-) {
-    let own: &[u8; LANES] = parents[centre..]
-        .first_chunk()
-        .expect("invariant: every tap reads a whole chunk of places");
-    let mut next = [ESCAPED; LANES];
-    for table in fast {
-        let mut states = *lanes;
-        blend::<DIFFER>(&mut states, &table.neighbours, parents);
-        let before = states;
-        for &(from, to) in &table.changes {
-            replace(&mut states, to, |lane| before[lane] == from);
-        }
-        if let Some(bound) = &table.bound {
-            replace(&mut states, table.likeliest, |lane| {
-                is_within::<DIFFER>(lanes[lane], bound[lane])
-            });
-        }
-        for lane in 0..LANES {
-            let chosen = u8::from(own[lane] == table.own).wrapping_neg();
-            next[lane] ^= (next[lane] ^ states[lane]) & chosen;
-        }
-    }
-    *lanes = next;
-}
-
-#[inline(always)]
-fn replace(lanes: &mut [u8; LANES], by: u8, is_chosen: impl Fn(usize) -> bool) {
-    for (lane, state) in lanes.iter_mut().enumerate() {
-        let chosen = u8::from(is_chosen(lane)).wrapping_neg();
-        *state ^= (*state ^ by) & chosen;
-    }
+pub(super) fn lanes_from(states: &[u8], at: usize) -> &[u8; LANES] {
+    let lanes = states[at..].first_chunk();
+    lanes.expect("invariant: every tap reads a whole chunk of places")
 }
 
 /// Returns the high bits of all lanes, with the bit of lane `8 w + b` at position `8 b + w`. This order needs only one

@@ -11,7 +11,7 @@
 
 use super::lanes::Words;
 use super::mixture::Mixture;
-use super::places::{OFF_GRID, Places, centre};
+use super::places::{OFF_GRID, Places};
 
 /// Mark of a cell to be drawn again, because its parent is off the grid or was rejected. Its high bit distinguishes it
 /// from all states, and its odd value from the mark of an escaped byte.
@@ -34,8 +34,8 @@ const MAX_RULES: usize = 1 << 16;
 /// cell. The residual distribution of the wildfire model has 53 rules.
 #[derive(Debug)]
 pub(super) struct Parents {
-    /// Two alias tables per mixture: for the residual distribution, then for the whole distribution. All tables have
-    /// the same length, a power of two.
+    /// Two alias tables: for the residual distribution, then for the whole distribution. Both have the same length, a
+    /// power of two.
     slots: Vec<Slot>,
     log_n_slots: u32,
     /// Rows of outcomes by parent state. The length of a row is a power of two.
@@ -43,10 +43,6 @@ pub(super) struct Parents {
     /// Bit mask that turns a parent's state into an index within a row, and [`OFF_GRID`] into the index of the last
     /// entry.
     mask: u8,
-    /// The offset of the cell from its home, if the cell's own state selects the mixture.
-    own: Option<usize>,
-    /// For each home, the index of the first mixture of its zone, if the model has several zones.
-    first_mixtures: Option<Vec<u16>>,
 }
 
 /// A tap, and the outcome for each state of its parent.
@@ -67,28 +63,16 @@ struct Slot {
 }
 
 impl Parents {
-    /// Makes two tables for each mixture: one for the residual distribution that bytes leave, and one for the whole
-    /// distribution. `offsets` contains the offset of each tap's neighbour from a cell's home, and `zones` the zone of
-    /// each home. Returns `None` if there would be too many rules.
-    pub(super) fn new(
-        mixtures: &[Mixture],
-        offsets: &[usize],
-        zones: Option<&[u8]>,
-    ) -> Option<Self> {
-        let n_weights: usize = mixtures.iter().map(Mixture::n_weights).sum();
-        if n_weights + mixtures.len() * offsets.len() > MAX_RULES {
+    /// Makes a table for the residual distribution that bytes leave, and one for the whole distribution. `offsets`
+    /// contains the offset of each tap's neighbour from a cell's home. Returns `None` if there would be too many rules.
+    pub(super) fn new(mixture: &Mixture, offsets: &[usize]) -> Option<Self> {
+        if mixture.n_weights() + offsets.len() > MAX_RULES {
             return None;
         }
         let mut outcomes = Vec::new();
         let none = vec![0; offsets.len()];
-        let mut tables = Vec::new();
-        for mixture in mixtures {
-            for taken in [mixture.counts(), &none] {
-                tables.push(rules(mixture, offsets, taken, &mut outcomes));
-            }
-        }
-        let n_own = mixtures.len() / mixtures[0].n_zones();
-        let first = |&zone: &u8| u16::from(zone) * n_own as u16;
+        let tables = [mixture.counts(), &none];
+        let tables = tables.map(|taken| rules(mixture, offsets, taken, &mut outcomes));
         let most_rules = tables.iter().map(Vec::len).max().unwrap_or(0);
         let n_slots = most_rules.next_power_of_two();
         let slots = tables.iter().map(|rules| alias_table(rules, n_slots));
@@ -96,9 +80,7 @@ impl Parents {
             slots: slots.flatten().collect(),
             log_n_slots: n_slots.trailing_zeros(),
             outcomes,
-            mask: (row_length(mixtures[0].n_states()) - 1) as u8,
-            own: (n_own > 1).then(|| centre(offsets)),
-            first_mixtures: zones.map(|zones| zones.iter().map(first).collect()),
+            mask: (row_length(mixture.n_states()) - 1) as u8,
         })
     }
 
@@ -117,20 +99,7 @@ impl Parents {
             let randoms = &mut randoms[..n_undecided.next_multiple_of(2) * 4];
             words.fill(randoms);
             let undecided = &mut undecided[..n_undecided];
-            n_undecided = match (self.own, &self.first_mixtures) {
-                (None, None) => self.round(places, undecided, randoms, |_, _| 0),
-                (Some(own), None) => self.round(places, undecided, randoms, |states, home| {
-                    usize::from(states[home + own])
-                }),
-                (None, Some(first)) => self.round(places, undecided, randoms, |_, home| {
-                    usize::from(first[home])
-                }),
-                (Some(own), Some(first)) => {
-                    self.round(places, undecided, randoms, |states, home| {
-                        usize::from(first[home]) + usize::from(states[home + own])
-                    })
-                }
-            };
+            n_undecided = self.round(places, undecided, randoms);
             if n_undecided == 0 {
                 break;
             }
@@ -138,16 +107,9 @@ impl Parents {
         n_undecided
     }
 
-    /// Draws once for every listed cell. `mixture` returns the index of a cell's mixture from the states and the cell's
-    /// home. Moves rejected cells to the front of the list, and returns their number.
-    #[inline(never)] // For the same reason as `Bytes::list_undecided`.
-    fn round(
-        &self,
-        places: &mut Places,
-        undecided: &mut [u32],
-        randoms: &[u8],
-        mixture: impl Fn(&[u8], usize) -> usize,
-    ) -> usize {
+    /// Draws once for every listed cell. Moves rejected cells to the front of the list, and returns their number.
+    #[inline(never)] // For the same reason as `Marked::list`.
+    fn round(&self, places: &mut Places, undecided: &mut [u32], randoms: &[u8]) -> usize {
         let (states, next) = (&places.states[..], &mut places.next[..]);
         let randoms = &randoms.as_chunks().0[..undecided.len()];
         let mut n_rejected = 0;
@@ -155,8 +117,7 @@ impl Parents {
             let home = undecided[index];
             let mark = next[home as usize];
             let random = u32::from_le_bytes(randoms[index]);
-            let mixture = mixture(states, home as usize);
-            let state = self.outcome(mixture, mark, random, states, home);
+            let state = self.outcome(mark, random, states, home);
             next[home as usize] = state;
             // Branch-free, because the processor cannot predict rejections.
             undecided[n_rejected] = home;
@@ -168,8 +129,8 @@ impl Parents {
     /// Draws an outcome for the cell at `home`. The cell's mark selects the distribution: the residual one after its
     /// byte escaped, the whole one after a rejection.
     #[inline]
-    fn outcome(&self, mixture: usize, mark: u8, random: u32, states: &[u8], home: u32) -> u8 {
-        let table = (mixture << 1 | usize::from(mark & 1)) << self.log_n_slots;
+    fn outcome(&self, mark: u8, random: u32, states: &[u8], home: u32) -> u8 {
+        let table = usize::from(mark & 1) << self.log_n_slots;
         let slot = &self.slots[(u64::from(random) << self.log_n_slots >> 32) as usize | table];
         let within = random << self.log_n_slots;
         let rule = slot.rules[usize::from(within >= slot.threshold)];

@@ -9,7 +9,7 @@ use super::super::grid::Shape;
 use super::super::parameters::Model;
 use super::lanes::LANES;
 
-/// The value of places outside the grid that add no weight.
+/// The value of places outside the grid that have no influence.
 pub(super) const OFF_GRID: u8 = 255;
 
 #[derive(Debug, Clone)]
@@ -26,7 +26,7 @@ pub(super) struct Places {
 
 impl Places {
     pub(super) fn new(model: &Model, shape: Shape) -> Self {
-        let (_, _, kernel_height, kernel_width) = model.kernel().dim();
+        let [kernel_height, kernel_width] = model.kernel_size();
         let (n_places, n_homes) = Self::lengths(model, shape);
         Self {
             width: shape.width(),
@@ -39,29 +39,22 @@ impl Places {
 
     /// Returns the number of places and the number of homes.
     pub(super) fn lengths(model: &Model, shape: Shape) -> (usize, usize) {
-        let (_, _, kernel_height, kernel_width) = model.kernel().dim();
+        let [kernel_height, kernel_width] = model.kernel_size();
         let stride = shape.width() + kernel_width - 1;
         let n_homes = (shape.height() * stride).next_multiple_of(LANES);
         let n_places = n_homes + (kernel_height - 1) * stride + kernel_width - 1;
         (n_places, n_homes)
     }
 
-    /// Returns, for each tap of a model's kernel, the offset of the neighbour's place from the cell's home.
-    pub(super) fn offsets(&self, model: &Model) -> Vec<usize> {
-        let (_, _, kernel_height, kernel_width) = model.kernel().dim();
-        let taps = ndarray::indices((kernel_height, kernel_width)).into_iter();
-        taps.map(|(row, col)| row * self.stride + col).collect()
+    /// Returns the home of a cell.
+    pub(super) fn home(&self, row: usize, col: usize) -> usize {
+        row * self.stride + col
     }
 
-    /// Returns the zone of each cell, indexed by home, if the model has several zones. Homes that belong to no cell
-    /// have zone 0.
-    pub(super) fn zones(&self, model: &Model) -> Option<Vec<u8>> {
-        let map = model.zone_map().filter(|_| model.n_zones() > 1)?;
-        let mut zones = vec![0; self.next.len()];
-        for (row, to) in map.rows().into_iter().zip(zones.chunks_mut(self.stride)) {
-            to[..self.width].copy_from_slice(&row.to_vec());
-        }
-        Some(zones)
+    /// Returns the offset of a cell from its home.
+    pub(super) fn centre(&self) -> usize {
+        let [above, left] = self.margins;
+        above * self.stride + left
     }
 
     /// Copies the states of the grid's cells into the places between the margins.
@@ -82,9 +75,4 @@ impl Places {
             to.copy_from_slice(&from[..self.width]);
         }
     }
-}
-
-/// Returns the offset of a cell from its home.
-pub(super) fn centre(offsets: &[usize]) -> usize {
-    offsets[offsets.len() / 2]
 }

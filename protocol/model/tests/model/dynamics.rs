@@ -2,11 +2,10 @@
 //! authors' worlds.
 
 use super::models::{
-    checked, formula, model, random_land, random_model, random_own_model, random_states, shape,
-    with_edge, zoned,
+    formula, model, random_hazards, random_model, random_states, shape, with_edge,
 };
 use super::statistics;
-use emberwatch_model::{Dynamics, Grid, KernelEntry, Model, Shape};
+use emberwatch_model::{Dynamics, Grid, Model, Shape};
 use ndarray::{Array3, Axis, array};
 
 fn burnout() -> Model {
@@ -100,53 +99,26 @@ fn random_models_are_drawn_from_the_formula() {
         check(&model, &states, n_draws);
         check(&with_edge(&model, 3), &states, n_draws);
     }
-    for (key, n_states, kernel_size, side, n_draws) in [
-        (4, 4, [5, 5], (7, 5), 100_000),
-        (6, 6, [3, 7], (4, 3), 100_000),
-        (8, 2, [1, 1], (2, 3), 100_000),
-        (14, 24, [3, 3], (2, 2), 20_000),
-    ] {
-        let states = random_states(key + 1, n_states, side);
-        check(
-            &random_own_model(key, n_states, kernel_size),
-            &states,
-            n_draws,
-        );
-    }
 }
 
 #[test]
-fn lands_are_drawn_from_the_formula() {
-    let random = [random_model, random_own_model];
-    for (sees_own, n_states, n_zones, side, n_draws) in [
-        (0, 4, 3, (7, 5), 100_000),
-        (1, 4, 3, (7, 5), 100_000),
-        (0, 3, 9, (3, 140), 20_000),
-        (1, 3, 9, (3, 140), 20_000),
-        (1, 3, 1, (4, 4), 50_000),
-        // Too many weights for tables, so kernels are summed.
-        (1, 16, 5, (2, 3), 20_000),
+fn random_hazards_are_drawn_from_the_formula() {
+    for (key, n_states, kernel_size, side, has_maps, n_draws) in [
+        (4, 4, [5, 5], (7, 5), false, 100_000),
+        // A table larger than the grid.
+        (6, 6, [3, 7], (4, 3), false, 100_000),
+        (8, 2, [1, 1], (2, 3), false, 100_000),
+        (9, 64, [3, 3], (4, 4), false, 20_000),
+        (10, 2, [15, 15], (9, 20), false, 20_000),
+        // Several chunks and bands.
+        (11, 3, [3, 3], (92, 91), false, 2_000),
+        (12, 3, [3, 3], (7, 5), true, 100_000),
+        (13, 3, [3, 5], (6, 140), true, 20_000),
     ] {
-        let of_zone = |zone: u64| random[sees_own](7 + 1000 * zone, n_states, [3, 3]);
-        let models: Vec<Model> = (0..n_zones).map(of_zone).collect();
-        let states = random_states(8, n_states, side);
-        check(&random_land(7, &models, side), &states, n_draws);
-    }
-    // Cells of a river never burn, so a random byte always decides them.
-    let mut river = burnout().file().clone();
-    let entry = |state: &String| KernelEntry {
-        zone: None,
-        own: Some(state.clone()),
-        from: state.clone(),
-        to: "unburnt".into(),
-        scale: 1.0,
-        weights: vec![vec![0.0; 3], vec![0.0, 1.0, 0.0], vec![0.0; 3]],
-    };
-    river.kernel = burnout().state_names().iter().map(entry).collect();
-    let river = checked(river);
-    for models in [[burnout(), river.clone()], [river, burnout()]] {
-        let states = random_states(5, 3, (6, 70));
-        check(&zoned(&models, 3, (6, 70)), &states, 20_000);
+        let states = random_states(key + 1, n_states, side);
+        let model = random_hazards(key, n_states, kernel_size, has_maps.then_some(side));
+        check(&model, &states, n_draws);
+        check(&with_edge(&model, 1), &states, n_draws);
     }
 }
 
