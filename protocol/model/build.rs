@@ -9,7 +9,10 @@ use std::path::{Path, PathBuf};
 
 fn main() {
     let text = |file: &Path| format!("include_str!({file:?})");
-    write("models", entries("models", "toml", |file| text(&with_maps(&file))));
+    write(
+        "models",
+        entries("models", "toml", |file| text(&with_maps(&file))),
+    );
     write("tasks", entries("tasks", "toml", |file| text(&file)));
     let states = entries("landscapes", "", |folder| {
         let file = folder.join(folder.file_name().expect("a name"));
@@ -74,5 +77,7 @@ fn write(kind: &str, entries: Vec<String>) {
 }
 
 fn out() -> PathBuf {
-    std::env::var_os("OUT_DIR").expect("cargo names a folder").into()
+    std::env::var_os("OUT_DIR")
+        .expect("cargo names a folder")
+        .into()
 }

@@ -192,13 +192,21 @@ impl Checker<'_> {
         }
         if !has_transitions {
             return match &file.maps {
-                Some(_) => self.wrong("maps".into(), "none, because no transition uses them", "maps"),
+                Some(_) => self.wrong(
+                    "maps".into(),
+                    "none, because no transition uses them",
+                    "maps",
+                ),
                 None => Ok(false),
             };
         }
         if let Some([height, width]) = file.kernel_size {
             let expected = "none, because `near` has the size";
-            return self.wrong("kernel_size".into(), expected, format!("[{height}, {width}]"));
+            return self.wrong(
+                "kernel_size".into(),
+                expected,
+                format!("[{height}, {width}]"),
+            );
         }
         match file.states.iter().find(|state| state.bias != 0.0) {
             Some(state) => {
@@ -232,7 +240,10 @@ impl Checker<'_> {
     }
 
     fn is_odd(&self, what: String, size: [usize; 2]) -> Result<(), ModelError> {
-        if size.iter().all(|side| side % 2 == 1 && *side <= MAX_KERNEL_SIDE) {
+        if size
+            .iter()
+            .all(|side| side % 2 == 1 && *side <= MAX_KERNEL_SIDE)
+        {
             return Ok(());
         }
         let expected = format!("two odd numbers up to {MAX_KERNEL_SIDE}");
@@ -290,10 +301,14 @@ impl Checker<'_> {
                 _ => None,
             };
             if of_map.is_none() || (shape.is_some() && shape != of_map) {
-                let expected = "shape [H, W] or [KH, KW, H, W], with the same grid H x W in all maps";
+                let expected =
+                    "shape [H, W] or [KH, KW, H, W], with the same grid H x W in all maps";
                 return self.wrong(what(), expected, format!("{:?}", map.shape()));
             }
-            if let Some(got) = map.iter().find(|factor| !(0.0..=MAX_FACTOR).contains(*factor)) {
+            if let Some(got) = map
+                .iter()
+                .find(|factor| !(0.0..=MAX_FACTOR).contains(*factor))
+            {
                 let expected = format!("factors from 0 to {MAX_FACTOR}");
                 return self.wrong(what(), &expected, got);
             }
@@ -309,12 +324,19 @@ impl Checker<'_> {
             let Some(map) = maps.get(name) else {
                 let names: Vec<&String> = maps.keys().collect();
                 let expected = format!("one of the maps {}", shortened(&format!("{names:?}")));
-                return self.wrong(format!("{}: times", entry.what()), &expected, format!("{name:?}"));
+                return self.wrong(
+                    format!("{}: times", entry.what()),
+                    &expected,
+                    format!("{name:?}"),
+                );
             };
             let size = [map.shape()[0], map.shape()[1]];
             let is_of_size = |table: &Vec<Vec<f64>>| [table.len(), table[0].len()] == size;
             if map.ndim() == 4 && !entry.near.values().all(is_of_size) {
-                let expected = format!("tables `near` of {} x {} cells, as in map {name:?}", size[0], size[1]);
+                let expected = format!(
+                    "tables `near` of {} x {} cells, as in map {name:?}",
+                    size[0], size[1]
+                );
                 return self.wrong(entry.what(), &expected, "another size");
             }
             factors.multiply(map);

@@ -262,7 +262,10 @@ impl From<toml::de::Error> for ModelError {
     /// Adds advice if the text contains a key of earlier releases.
     fn from(error: toml::de::Error) -> Self {
         let mut text = parse_problem(&error) + "\n";
-        let has = |keys: &[&str]| keys.iter().any(|key| error.message().contains(&format!("field `{key}`")));
+        let has = |keys: &[&str]| {
+            keys.iter()
+                .any(|key| error.message().contains(&format!("field `{key}`")))
+        };
         if has(&["rings", "pays"]) {
             text += "remove `rings` and `pays`: a sensor has one observation matrix, and rewards are for \
                      visited cells\n";

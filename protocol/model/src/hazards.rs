@@ -90,7 +90,9 @@ impl Factors {
 
     /// Returns the factor of a transition's hazard without neighbours in a cell.
     pub fn of_base(&self, Cell { row, col }: Cell) -> f64 {
-        self.of_cells.as_ref().map_or(1.0, |map| map[[row, col]].into())
+        self.of_cells
+            .as_ref()
+            .map_or(1.0, |map| map[[row, col]].into())
     }
 
     /// Returns the factor of a neighbour's hazard in a cell. The offset is that of the neighbour.
@@ -162,7 +164,7 @@ mod tests {
         for exponent in -300..0 {
             for mantissa in 1..20 {
                 let p = f64::from(mantissa) / 20.0 * 2_f64.powi(exponent / 5);
-                for p in [p, 1.0 - p].into_iter().filter(|p| *p > 0.0) {
+                for p in [p, 1.0 - p].into_iter().filter(|p| 0.0 < *p && *p < 1.0) {
                     let expected = -(-p).ln_1p();
                     assert!((hazard(p) / expected - 1.0).abs() < 1e-14, "{p}");
                 }

@@ -64,12 +64,15 @@ impl MapsEntry {
         let npz = match self {
             Self::Packed { npz } => npz,
             Self::File(name) => {
-                let expected = "an archive in the model, because the model was not read from a file";
+                let expected =
+                    "an archive in the model, because the model was not read from a file";
                 return Err((expected.into(), format!("{:?}", shortened(name))));
             }
         };
         let broken = |problem: String| ("an .npz archive in base64".to_owned(), problem);
-        let bytes = BASE64.decode(npz).map_err(|error| broken(error.to_string()))?;
+        let bytes = BASE64
+            .decode(npz)
+            .map_err(|error| broken(error.to_string()))?;
         read_archive(&bytes).map_err(broken)
     }
 
@@ -109,17 +112,23 @@ fn read_file(path: &Path) -> Result<Vec<u8>, String> {
 
 /// Reads all arrays of an archive. What is allocated grows with the bytes that are present, and stays below the limit.
 fn read_archive(bytes: &[u8]) -> Result<Maps, String> {
-    let unfit = |error| format!("expected an .npz (zip) archive, got another or a damaged file ({error})");
+    let unfit =
+        |error| format!("expected an .npz (zip) archive, got another or a damaged file ({error})");
     let mut archive = ZipArchive::new(Cursor::new(bytes)).map_err(unfit)?;
     let members: Vec<String> = archive.file_names().map(String::from).collect();
     let mut maps = Maps::new();
     let mut n_left = MAX_MAP_VALUES;
     for member in members {
         let Some(name) = member.strip_suffix(".npy") else {
-            return Err(format!("expected only .npy members, got {:?}", shortened(&member)));
+            return Err(format!(
+                "expected only .npy members, got {:?}",
+                shortened(&member)
+            ));
         };
         let array = |problem: String| format!("array {:?}: {problem}", shortened(name));
-        let file = archive.by_name(&member).map_err(|error| array(error.to_string()))?;
+        let file = archive
+            .by_name(&member)
+            .map_err(|error| array(error.to_string()))?;
         let mut bytes = Vec::new();
         // Each value has at most 8 bytes.
         let read = file.take(8 * n_left as u64 + 1024).read_to_end(&mut bytes);
@@ -169,7 +178,8 @@ mod tests {
 
     fn two() -> Maps {
         let fuel = Array::from_shape_fn((3, 4), |(row, col)| (row * col) as f32 / 7.0);
-        let slope = Array::from_shape_fn((3, 3, 3, 4), |(a, c, row, col)| (a + c * row + col) as f32);
+        let slope =
+            Array::from_shape_fn((3, 3, 3, 4), |(a, c, row, col)| (a + c * row + col) as f32);
         [("fuel", fuel.into_dyn()), ("slope", slope.into_dyn())]
             .map(|(name, map)| (name.to_owned(), map))
             .into()

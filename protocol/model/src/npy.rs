@@ -43,12 +43,16 @@ impl<'b> Npy<'b> {
 
     /// Returns the number of values that the header states, or `None` if it overflows.
     pub fn n_values(&self) -> Option<usize> {
-        self.shape.iter().try_fold(1, |n: usize, &side| n.checked_mul(side))
+        self.shape
+            .iter()
+            .try_fold(1, |n: usize, &side| n.checked_mul(side))
     }
 
     /// Returns the values if they have type `T`. The parser allocates what the header states, so check the number of
     /// values first.
     pub fn read<T: ReadableElement>(&self) -> Option<ArrayD<T>> {
-        ArrayD::<T>::read_npy(Cursor::new(self.bytes)).ok().filter(|it| it.raw_dim() == IxDyn(&self.shape))
+        ArrayD::<T>::read_npy(Cursor::new(self.bytes))
+            .ok()
+            .filter(|it| it.raw_dim() == IxDyn(&self.shape))
     }
 }

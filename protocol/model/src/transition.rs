@@ -51,9 +51,8 @@ impl Transition {
     pub fn new(kernel: &Array4<f64>, bias: &[f64], edge: Option<usize>, shape: Shape) -> Self {
         let (n_states, _, height, width) = kernel.dim();
         let layout = Layout::new(shape, height, width);
-        let (columns, groups): (Vec<_>, Vec<_>) = taps_that_weigh_alike(kernel, layout)
-            .into_iter()
-            .unzip();
+        let (columns, groups): (Vec<_>, Vec<_>) =
+            taps_that_weigh_alike(kernel, layout).into_iter().unzip();
         let mut planes = vec![0.0; n_states * layout.plane];
         if let Some(edge) = edge {
             // `load` replaces the values inside the margins.

@@ -248,7 +248,11 @@ impl Homes<'_> {
         offsets.dedup();
         let change = |transition: &Transition| {
             let row = n_states + 1;
-            let n_neighbours = if transition.near.is_empty() { 0 } else { offsets.len() };
+            let n_neighbours = if transition.near.is_empty() {
+                0
+            } else {
+                offsets.len()
+            };
             let mut near = vec![0.0; n_neighbours * row];
             for it in &transition.near {
                 let index = offsets.binary_search(&it.offset);
@@ -294,10 +298,14 @@ impl Homes<'_> {
     fn bound(&self, from: usize, transitions: &[Transition]) -> Bound {
         let is_alike = transitions.iter().all(|it| it.factors.are_one());
         let mut base = self.counts(is_alike, |cell| {
-            let bases = transitions.iter().map(|it| scaled(it.base, it.factors.of_base(cell)));
+            let bases = transitions
+                .iter()
+                .map(|it| scaled(it.base, it.factors.of_base(cell)));
             bases.sum()
         });
-        base.0.iter_mut().for_each(|count| *count = count.saturating_sub(1));
+        base.0
+            .iter_mut()
+            .for_each(|count| *count = count.saturating_sub(1));
         let mut by_neighbour: BTreeMap<_, Vec<(&Factors, f64)>> = BTreeMap::new();
         for transition in transitions {
             for near in &transition.near {
@@ -308,7 +316,8 @@ impl Homes<'_> {
         let neighbour = |((offset, state), hazards): (_, Vec<(&Factors, f64)>)| {
             let hazard = |cell| {
                 let hazards = hazards.iter();
-                let hazards = hazards.map(|(it, hazard)| scaled(*hazard, it.of_neighbour(offset, cell)));
+                let hazards =
+                    hazards.map(|(it, hazard)| scaled(*hazard, it.of_neighbour(offset, cell)));
                 hazards.sum()
             };
             Neighbour {

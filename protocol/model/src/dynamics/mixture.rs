@@ -84,7 +84,11 @@ impl<'k> Mixture<'k> {
 /// Returns, for each state, the next state with the largest sum of weights.
 fn likeliest(kernel: &Kernel) -> Vec<usize> {
     let likeliest = |from| {
-        let sum = |to: usize| (0..kernel.n_taps).map(|tap| kernel.weights(tap, from)[to]).sum();
+        let sum = |to: usize| {
+            (0..kernel.n_taps)
+                .map(|tap| kernel.weights(tap, from)[to])
+                .sum()
+        };
         let sums: Vec<f64> = (0..kernel.n_states).map(sum).collect();
         let better = |best, to| if sums[to] > sums[best] { to } else { best };
         (0..kernel.n_states).fold(0, better)

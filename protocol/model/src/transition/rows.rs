@@ -41,7 +41,9 @@ pub(super) fn kernel_rows(kernel: &Array4<f64>, bias: &[f64], columns: &[Vec<f64
         let terms = columns.iter().map(|column| scaled(column[to])).enumerate();
         Row {
             bias: scaled(bias[to]),
-            terms: terms.filter(|(group, _)| columns[*group][to] > 0.0).collect(),
+            terms: terms
+                .filter(|(group, _)| columns[*group][to] > 0.0)
+                .collect(),
         }
     };
     (0..bias.len()).map(row).collect()

@@ -62,7 +62,12 @@ pub fn random_model(key: u64, n_states: usize, [height, width]: [usize; 2]) -> M
 
 /// Makes a random model of hazards. Some transitions are certain, some have no neighbours, and with a side of maps, some
 /// have factors.
-pub fn random_hazards(key: u64, n_states: usize, [height, width]: [usize; 2], maps: Option<(usize, usize)>) -> Model {
+pub fn random_hazards(
+    key: u64,
+    n_states: usize,
+    [height, width]: [usize; 2],
+    maps: Option<(usize, usize)>,
+) -> Model {
     let template = random_model(key, n_states, [1, 1]).file().clone();
     let mut numbers = (0..).map(|index| unit(key, index));
     let mut number = || numbers.next().expect("endless");
@@ -73,7 +78,13 @@ pub fn random_hazards(key: u64, n_states: usize, [height, width]: [usize; 2], ma
     };
     file.states.iter_mut().for_each(|state| state.bias = 0.0);
     if let Some((rows, cols)) = maps {
-        let mut factor = |_| if number() < 0.1 { 0.0 } else { 2.0 * number() as f32 };
+        let mut factor = |_| {
+            if number() < 0.1 {
+                0.0
+            } else {
+                2.0 * number() as f32
+            }
+        };
         let fuel = ArrayD::from_shape_fn(vec![rows, cols], |at| factor(at));
         let wind = ArrayD::from_shape_fn(vec![height, width, rows, cols], |at| factor(at));
         let maps = [("fuel".to_owned(), fuel), ("wind".to_owned(), wind)].into();
@@ -92,18 +103,28 @@ pub fn random_hazards(key: u64, n_states: usize, [height, width]: [usize; 2], ma
             let base = probability(0.2);
             let mut table = || {
                 let mut table = vec![vec![0.0; width]; height];
-                table.iter_mut().flatten().for_each(|p| *p = probability(0.6));
+                table
+                    .iter_mut()
+                    .flatten()
+                    .for_each(|p| *p = probability(0.6));
                 table[height / 2][width / 2] = 0.0;
                 table
             };
             let near = [(to, table()), (from, table())];
-            let times = if maps.is_none() { &[][..] } else { &["fuel", "wind"] };
+            let times = if maps.is_none() {
+                &[][..]
+            } else {
+                &["fuel", "wind"]
+            };
             file.transitions.push(TransitionEntry {
                 from: format!("s{from}"),
                 to: format!("s{to}"),
                 base,
                 times: times.iter().map(|&name| name.to_owned()).collect(),
-                near: near.into_iter().map(|(state, table)| (format!("s{state}"), table)).collect(),
+                near: near
+                    .into_iter()
+                    .map(|(state, table)| (format!("s{state}"), table))
+                    .collect(),
             });
         }
     }
@@ -162,7 +183,10 @@ fn of_ratio(model: &Model, p: &Array3<f64>, cell: (usize, usize)) -> Vec<f64> {
 /// are independent.
 fn of_hazards(model: &Model, p: &Array3<f64>, cell: (usize, usize)) -> Vec<f64> {
     let file = model.file();
-    let maps = file.maps.as_ref().map(|maps| maps.unpack().expect("packed"));
+    let maps = file
+        .maps
+        .as_ref()
+        .map(|maps| maps.unpack().expect("packed"));
     let mut next = vec![0.0; file.states.len()];
     for (from, state) in file.states.iter().enumerate() {
         let here = p[[from, cell.0, cell.1]];
@@ -173,12 +197,19 @@ fn of_hazards(model: &Model, p: &Array3<f64>, cell: (usize, usize)) -> Vec<f64> 
         for entry in file.transitions.iter().filter(|it| it.from == state.name) {
             let map = |name: &str| Some(&maps.as_ref()?[name]).filter(|_| !entry.times.is_empty());
             let fuel = map("fuel").map_or(1.0, |map| f64::from(map[[cell.0, cell.1]]));
-            let power = |p: f64, factor: f64| if factor == 0.0 { 1.0 } else { (1.0 - p).powf(factor) };
+            let power = |p: f64, factor: f64| {
+                if factor == 0.0 {
+                    1.0
+                } else {
+                    (1.0 - p).powf(factor)
+                }
+            };
             base *= power(entry.base, fuel);
             for (of, table) in &entry.near {
                 let size = [table.len(), table[0].len()];
                 for at in ndarray::indices((size[0], size[1])) {
-                    let wind = map("wind").map_or(1.0, |map| f64::from(map[[at.0, at.1, cell.0, cell.1]]));
+                    let wind =
+                        map("wind").map_or(1.0, |map| f64::from(map[[at.0, at.1, cell.0, cell.1]]));
                     let place = (size.map(|side| side / 2), at, of.clone());
                     *near.entry(place).or_insert(1.0) *= power(table[at.0][at.1], fuel * wind);
                 }
