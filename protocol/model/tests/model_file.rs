@@ -2,8 +2,10 @@
 
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::text::MAX_TEXT_BYTES;
-use emberwatch_model::{Description, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MAX_ZONES};
-use emberwatch_model::{Model, Shape};
+use emberwatch_model::{
+    Description, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, MapsEntry, Model, ModelFile, Shape,
+};
+use ndarray::ArrayD;
 use std::collections::BTreeSet;
 use toml::{Table, Value};
 
@@ -19,6 +21,10 @@ fn keys(of: &str, table: &Table) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for (key, value) in table {
         found.insert(format!("{of}{key}"));
+        if ["maps", "near"].contains(&key.as_str()) {
+            // The keys of `near` are names of states.
+            continue;
+        }
         let entries = value.as_array().into_iter().flatten();
         let entries = entries.chain(value.is_table().then_some(value));
         for entry in entries.filter_map(Value::as_table) {
@@ -36,6 +42,8 @@ fn the_page_has_models_of_every_key_and_explains_each() {
         let heading = words.iter().find_map(|words| line.strip_prefix(words));
         if let Some((name, _)) = heading.and_then(|rest| rest.split_once('`')) {
             of = format!("{name} ");
+        } else if line == "Of the model:" {
+            of.clear();
         } else if let Some(rest) = line.strip_prefix("| `") {
             let (key, _) = rest.split_once('`').expect("a key");
             assert!(documented.insert(format!("{of}{key}")), "{key} twice");
@@ -43,9 +51,14 @@ fn the_page_has_models_of_every_key_and_explains_each() {
     }
     let (mut used, mut parsed) = (BTreeSet::new(), BTreeSet::new());
     for example in examples(PAGE) {
-        let model = Model::from_toml(example).expect("a model");
-        let (height, width) = model.zone_map().map_or((64, 64), |map| map.dim());
-        let shape = Shape::new(height, width).expect("test shape");
+        let mut file: ModelFile = toml::from_str(example).expect("a model file");
+        let land = [
+            ("fuel".to_owned(), ArrayD::ones(vec![2, 4])),
+            ("wind".to_owned(), ArrayD::ones(vec![1, 3, 2, 4])),
+        ];
+        file.maps = file.maps.map(|_| MapsEntry::packed(&land.into()));
+        let model = Model::new(file).expect("a model");
+        let shape = Shape::new(2, 4).expect("test shape");
         assert_eq!(model.check_on(shape), Ok(()));
         used.extend(keys("", &example.parse().expect("TOML")));
         let file = Table::try_from(model.file()).expect("models serialise");
@@ -74,7 +87,10 @@ fn the_limits_are_the_parser_s() {
         (PAGE, format!("2 to {MAX_VALUES},")),
         (PAGE, format!("1 to {MAX_VALUES},")),
         (PAGE, format!("each odd, 1 to {side} |")),
-        (PAGE, format!("0 to {MAX_ZONES} kinds of land")),
+        (
+            PAGE,
+            format!("an odd number of rows and of columns up to {side}"),
+        ),
         (PAGE, format!("| `radius` | integer | 0 to {MAX_RADIUS} |")),
         (
             PAGE,
