@@ -81,7 +81,7 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let at = client.observe(0..1).expect("observe")[0].world;
     let model = Model::built_in("wildfire-small").expect("built in");
     let shape = client.shape();
-    let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape));
+    let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape), false);
     let kind = filter.expect("a filter").kind();
     let kind = format!("{kind}; freshness [H, W] as f32, rewards, paths");
     leave_belief(&mut client, 0, &at, &kind, b"not whole").expect("leave");

@@ -24,7 +24,7 @@ fn shape() -> Shape {
 }
 
 fn filter() -> BayesFilter {
-    BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model")
+    BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape()), false).expect("valid model")
 }
 
 /// Updates an estimator with the frames of 40 random walks, so that its belief is as uneven as in a real run.

@@ -55,7 +55,7 @@ fn the_filter_reproduces_posterior_and_predictor() {
         let predictors: Array4<f32> = golden.get(&format!("{case}_estimate"));
         let (_, height, width) = observations.dim();
         let prior = Belief::uniform(3, shape_of((height, width)));
-        let mut filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid model");
+        let mut filter = BayesFilter::known(&Model::wildfire(), prior, false).expect("valid model");
         let everything = Array2::from_elem((height, width), 1);
         for (step, observed) in observations.outer_iter().enumerate() {
             let index = saved.iter().position(|&at| at == step as i64);
@@ -89,7 +89,7 @@ fn check_masked(
         state.observed_as = (&exponentials / exponentials.sum()).to_vec();
     }
     let model = Model::new(file).expect("a softmax is a distribution");
-    let mut filter = BayesFilter::known(&model, belief_from(prior)).expect("valid model");
+    let mut filter = BayesFilter::known(&model, belief_from(prior), false).expect("valid model");
     filter.correct(frame).expect("possible frame");
     assert_close(filter.belief(), posterior, what);
 }

@@ -48,7 +48,7 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
         let model = Model::built_in(name).expect("a built-in model");
         for shape in [shape(1, 1), shape(20, 33)] {
             let prior = Belief::uniform(model.n_states(), shape);
-            let mut known = BayesFilter::known(&model, prior.clone()).expect("valid model");
+            let mut known = BayesFilter::known(&model, prior.clone(), false).expect("valid model");
             let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);
             for number in 0..30 {
                 let frame = frame(shape, model.n_observations(), number);

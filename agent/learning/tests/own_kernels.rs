@@ -107,7 +107,7 @@ fn distance(model: &Model, tables: &Tables) -> f64 {
         let mut states = dynamics.initial(seed);
         (0..500).for_each(|n| dynamics.step(seed, n, &mut states));
         let belief = Belief::from_states(&states, 3).expect("states of the model");
-        let mut truth = BayesFilter::known(model, belief.clone()).expect("a valid model");
+        let mut truth = BayesFilter::known(model, belief.clone(), false).expect("a valid model");
         let mut learned = BayesFilter::learned(tables, belief);
         truth.predict();
         learned.predict();

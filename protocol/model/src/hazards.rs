@@ -66,6 +66,24 @@ impl Hazards {
         &self.transitions[from]
     }
 
+    /// Returns all numbers on which the transitions depend. Models with the same numbers are equal.
+    pub fn numbers(&self) -> Vec<f64> {
+        let mut numbers = Vec::new();
+        for (from, transitions) in self.transitions.iter().enumerate() {
+            for it in transitions {
+                numbers.extend([from as f64, it.to as f64, it.base]);
+                for near in &it.near {
+                    let [row, col] = near.offset;
+                    numbers.extend([near.state as f64, row as f64, col as f64, near.hazard]);
+                }
+                let factors = it.factors.of_cells.iter().flatten();
+                let factors = factors.chain(it.factors.of_neighbours.iter().flatten());
+                numbers.extend(factors.map(|factor| f64::from(*factor)));
+            }
+        }
+        numbers
+    }
+
     /// Returns the maps by name.
     pub fn maps(&self) -> &Maps {
         &self.maps

@@ -8,117 +8,87 @@ use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
 use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
 use crate::estimation::parameters::Tables;
-use crate::estimation::prediction::{Prediction, PredictionKind, Weights};
+use crate::estimation::prediction::Prediction;
 use emberwatch_model::frame::Frame;
-use emberwatch_model::grid::Probabilities;
-use emberwatch_model::transition::Transition;
-use emberwatch_model::{Model, ModelError};
+use emberwatch_model::{Model, ModelError, Rule};
 use ndarray::Array2;
 use std::borrow::Cow;
 
 /// The Bayes filter of one world.
 #[derive(Debug, Clone)]
 pub struct BayesFilter {
-    transition: Transition,
-    /// The predictor to use instead of `transition`, or `None` for the mean field.
-    prediction: Option<Prediction>,
+    prediction: Prediction,
     /// `P(y | x)`, shape `[S, O]`.
     likelihood: Array2<f64>,
     belief: Belief,
-    /// Buffer for the next predictor. With cavities, it keeps a copy of the belief between predictions, because the
-    /// next correction of the cavities needs the belief before the correction.
-    predictor: Probabilities,
+    /// With cavities, the belief after the last prediction or correction, with which the next correction is compared.
+    before: Vec<f32>,
     /// Checksum of the parameters. A saved belief fits only a filter with the same parameters.
     checksum: u32,
 }
 
 impl BayesFilter {
-    /// Creates the filter of a known model, with `prior` as the predictor `u_0`. The filter predicts with the mean
-    /// field.
+    /// Creates the filter of a known model, with `prior` as the predictor `u_0`. With `cavities`, a model of hazards is
+    /// predicted without the influence of each cell on itself through its neighbours.
     ///
     /// # Errors
     /// If eq. 3 could divide by zero on the prior's grid, or a map of the model has a different grid.
     ///
     /// # Panics
     /// If the prior and the model have different numbers of states.
-    pub fn known(model: &Model, prior: Belief) -> Result<Self, ModelError> {
-        let expected = model.n_states();
-        assert_eq!(
-            prior.n_states(),
-            expected,
-            "prior: expected the model's number of states"
-        );
-        let transition = Transition::new(model, prior.shape())?;
-        let checksum = known_checksum(model);
+    pub fn known(model: &Model, prior: Belief, cavities: bool) -> Result<Self, ModelError> {
+        let prediction = Prediction::known(model, &prior, cavities)?;
         let likelihood = model.likelihood().clone();
-        Ok(Self::new(transition, likelihood, prior, checksum))
+        Ok(Self::new(
+            prediction,
+            likelihood,
+            prior,
+            known_checksum(model),
+        ))
     }
 
-    /// Creates a filter with learned parameters, and `prior` as the predictor `u_0`. The filter predicts with the mean
-    /// field.
+    /// Creates a filter with learned parameters, and `prior` as the predictor `u_0`.
     ///
     /// # Panics
     /// If the prior and the parameters have different numbers of states.
     pub fn learned(tables: &Tables, prior: Belief) -> Self {
-        let (transition, likelihood, checksum) = parameters(tables, &prior);
-        Self::new(transition, likelihood, prior, checksum)
+        let prediction = Prediction::learned(tables, &prior);
+        let likelihood = tables.likelihood_array();
+        let checksum = checksum(tables.kernels()[0].iter().copied(), &likelihood);
+        Self::new(prediction, likelihood, prior, checksum)
     }
 
-    /// Sets the kind of prediction of a filter with learned parameters. `tables` must be the filter's parameters.
-    pub fn predicting_learned(self, tables: &Tables, kind: PredictionKind) -> Self {
-        let weights = Weights {
-            kernels: &tables.kernels(),
-            bias: &vec![0.0; tables.dimensions.n_states],
-            zones: (None, 1),
-            edge: None,
-        };
-        self.predicting(weights, kind)
-    }
-
-    fn new(transition: Transition, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
+    fn new(prediction: Prediction, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
+        let before = prediction
+            .has_cavities()
+            .then(|| belief.as_slice().to_vec());
         Self {
-            transition,
-            prediction: None,
+            before: before.unwrap_or_default(),
+            prediction,
             likelihood,
-            predictor: belief.probabilities().clone(),
             belief,
             checksum,
         }
     }
 
-    /// Sets the kind of prediction of a known model's filter. `model` must be the filter's model.
-    pub fn predicting_known(self, model: &Model, kind: PredictionKind) -> Self {
-        self.predicting(model.into(), kind)
-    }
-
-    fn predicting(mut self, weights: Weights<'_>, kind: PredictionKind) -> Self {
-        if kind != PredictionKind::MeanField {
-            self.prediction = Some(Prediction::new(weights, kind, &self.belief));
-        }
-        self
-    }
-
     /// Updates the cavities after a correction of the belief.
     pub(super) fn correct_cavities(&mut self) {
-        if let Some(prediction) = &mut self.prediction {
-            let before = self.predictor.as_slice().expect("invariant: row-major");
-            prediction.correct(before, self.belief.as_slice());
-            if prediction.has_cavities() {
-                // A second correction in the same step starts from this belief.
-                self.predictor.assign(self.belief.probabilities());
-            }
+        if self.prediction.has_cavities() {
+            self.prediction
+                .correct(&self.before, self.belief.as_slice());
+            // A second correction in the same step starts from this belief.
+            self.before.copy_from_slice(self.belief.as_slice());
         }
     }
 
     /// Returns the [`Handover::kind`] of filters of a known model.
-    pub fn handover_of_known(model: &Model, kind: PredictionKind) -> String {
-        handover_of(known_checksum(model), kind)
+    pub fn handover_of_known(model: &Model, cavities: bool) -> String {
+        handover_of(known_checksum(model), cavities && model.hazards().is_some())
     }
 
     /// Returns the number of bytes of [`Handover::to_bytes`].
     pub(super) fn n_bytes(&self) -> usize {
-        let cavities = self.prediction.as_ref().map_or(0, Prediction::n_bytes);
-        4 * self.belief.as_slice().len() + cavities
+        4 * self.belief.as_slice().len() + self.prediction.n_bytes()
     }
 
     /// Returns the belief and `P(y | x)`, shape `[S, O]`.
@@ -141,26 +111,15 @@ impl Estimator for BayesFilter {
     }
 
     fn predict(&mut self) {
-        if let Some(prediction) = &mut self.prediction {
-            let predictor = self.predictor.as_slice_mut();
-            let predictor = predictor.expect("invariant: row-major");
-            prediction.predict(self.belief.as_slice(), predictor);
-            // Both buffers contain the predictor, because the next correction of the cavities compares the belief with
-            // it.
-            self.belief.as_mut_slice().copy_from_slice(predictor);
-            return;
+        self.prediction.predict(&mut self.belief);
+        if self.prediction.has_cavities() {
+            self.before.copy_from_slice(self.belief.as_slice());
         }
-        let belief = self.belief.probabilities_mut();
-        self.transition.apply(belief, &mut self.predictor);
-        std::mem::swap(belief, &mut self.predictor);
     }
 
     fn memory_bytes(&self) -> usize {
-        let prediction = self.prediction.as_ref();
-        size_of::<Self>()
-            + 2 * size_of_val(self.belief.as_slice())
-            + self.transition.memory_bytes()
-            + prediction.map_or(0, Prediction::memory_bytes)
+        let belief = size_of_val(self.belief.as_slice()) + size_of_val(&*self.before);
+        size_of::<Self>() + belief + self.prediction.memory_bytes()
     }
 
     /// Returns the predictor `u_k` before [`Estimator::correct`], and the posterior `p_k` after it.
@@ -183,13 +142,12 @@ impl Estimator for BayesFilter {
 
 impl Handover for BayesFilter {
     fn kind(&self) -> String {
-        let kind = self.prediction.as_ref().map(Prediction::kind);
-        handover_of(self.checksum, kind.unwrap_or_default())
+        handover_of(self.checksum, self.prediction.has_cavities())
     }
 
     fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = self.belief.to_bytes();
-        bytes.extend(self.prediction.iter().flat_map(Prediction::to_bytes));
+        bytes.extend(self.prediction.to_bytes());
         bytes
     }
 
@@ -198,51 +156,29 @@ impl Handover for BayesFilter {
             return false;
         };
         let belief = Belief::from_bytes(belief, self.belief.probabilities().dim());
-        let Some(belief) = belief else {
+        let Some(belief) = belief.filter(|_| self.prediction.restore(rest)) else {
             return false;
         };
-        let is_restored = match &mut self.prediction {
-            Some(prediction) => prediction.restore(rest),
-            None => rest.is_empty(),
-        };
-        if is_restored {
-            self.predictor.assign(belief.probabilities());
-            self.belief = belief;
+        self.belief = belief;
+        if self.prediction.has_cavities() {
+            self.before.copy_from_slice(self.belief.as_slice());
         }
-        is_restored
+        true
     }
 }
 
-fn handover_of(checksum: u32, kind: PredictionKind) -> String {
-    let kind = match kind {
-        PredictionKind::MeanField => "",
-        PredictionKind::SecondOrder => " of second order",
-        PredictionKind::Cavities => " with cavities",
-    };
+fn handover_of(checksum: u32, has_cavities: bool) -> String {
+    let kind = if has_cavities { " with cavities" } else { "" };
     format!("bayes_filter{kind} {checksum:08x}, probabilities [S, H, W] as f32")
 }
 
 fn known_checksum(model: &Model) -> u32 {
-    let weights = model.kernels().iter().flatten();
     let edge = model.edge().map(|edge| edge as f64);
-    let numbers = weights.chain(model.bias()).copied().chain(edge);
-    checksum(numbers, model.likelihood())
-}
-
-fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32) {
-    let dimensions = tables.dimensions;
-    let n_states = dimensions.n_states;
-    assert_eq!(
-        belief.n_states(),
-        n_states,
-        "belief: expected the parameters' number of states"
-    );
-    let kernels = tables.kernels();
-    let likelihood = tables.likelihood_array();
-    let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
-    let bias = vec![0.0; n_states];
-    let transition = Transition::of_weights(&kernels, &bias, belief.shape());
-    (transition, likelihood, checksum)
+    let numbers: Vec<f64> = match model.rule() {
+        Rule::Ratio(ratio) => ratio.kernel().iter().chain(ratio.bias()).copied().collect(),
+        Rule::Hazards(hazards) => hazards.numbers(),
+    };
+    checksum(numbers.into_iter().chain(edge), model.likelihood())
 }
 
 fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32 {
@@ -254,6 +190,7 @@ fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32
 #[cfg(test)]
 mod tests {
     use super::*;
+    use emberwatch_model::Probabilities;
     use emberwatch_model::grid::Shape;
 
     #[test]
@@ -262,8 +199,7 @@ mod tests {
         let model = Model::built_in("wildfire-burnout").expect("built in");
         let filter = || {
             let prior = Belief::uniform(model.n_states(), shape);
-            let filter = BayesFilter::known(&model, prior).expect("valid model");
-            filter.predicting_known(&model, PredictionKind::Cavities)
+            BayesFilter::known(&model, prior, true).expect("valid model")
         };
         let (mut whole, mut parts) = (filter(), filter());
         let mut values = [255; 12];
@@ -289,8 +225,8 @@ mod tests {
     #[test]
     fn correct_leaves_unseen_cells_unchanged() {
         let shape = Shape::new(1, 3).expect("test shape");
-        let mut filter =
-            BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
+        let mut filter = BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape), false)
+            .expect("valid");
         filter
             .correct(&frame(shape, &[255, 2, 255]))
             .expect("possible");
@@ -310,7 +246,7 @@ mod tests {
         file.states[0].observed_as = vec![1.0, 0.0, 0.0];
         file.states[2].observed_as = vec![0.999, 0.0005, 0.0005];
         let mut filter =
-            BayesFilter::known(&Model::new(file).expect("valid"), prior).expect("valid");
+            BayesFilter::known(&Model::new(file).expect("valid"), prior, false).expect("valid");
         filter.correct(&frame(shape, &[2])).expect("possible");
         assert_eq!(filter.belief().probability(2)[[0, 0]], 1.0);
     }

@@ -242,23 +242,19 @@ impl Tables {
     /// weight that is equal for all states of the neighbour.
     ///
     /// # Panics
-    /// If the model has several zones.
+    /// If it is a model of hazards.
     pub fn of_model(model: &Model) -> Self {
-        assert_eq!(
-            model.n_zones(),
-            1,
-            "zones: expected a model with a single zone"
-        );
+        let ratio = model.ratio().expect("model: expected a kernel");
         let cast = |value: &f64| *value as f32;
-        let (_, _, height, width) = model.kernel().dim();
+        let (_, _, height, width) = ratio.kernel().dim();
         Self {
             dimensions: Dimensions {
                 n_states: model.n_states(),
                 n_observations: model.n_observations(),
                 kernel: (height, width),
-                sees_own_state: model.sees_own_state(),
+                sees_own_state: false,
             },
-            kernel: model.kernels().iter().flatten().map(cast).collect(),
+            kernel: ratio.kernel().iter().map(cast).collect(),
             likelihood: model.likelihood().iter().map(cast).collect(),
             initial: model.initial().iter().map(cast).collect(),
         }

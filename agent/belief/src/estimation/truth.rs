@@ -2,15 +2,16 @@
 
 use crate::estimation::belief::{Belief, BeliefError};
 use crate::estimation::estimator::{Estimator, EstimatorError, Told};
+use crate::estimation::prediction::Prediction;
 use emberwatch_model::ModelError;
-use emberwatch_model::{Frame, Grid, Model, Probabilities, Transition};
+use emberwatch_model::{Frame, Grid, Model};
 
 /// An oracle that receives X_k, the states that the frame observed.
 ///
 /// Its belief gives these states probability 1, until [`Estimator::predict`] moves it one step ahead for the next path.
 pub struct Oracle {
     belief: Belief,
-    transition: Transition,
+    prediction: Prediction,
 }
 
 /// A constant belief, as if nothing were ever observed.
@@ -23,7 +24,7 @@ impl Oracle {
     /// If the model cannot be simulated on the prior's grid.
     pub fn new(model: &Model, prior: Belief) -> Result<Self, ModelError> {
         Ok(Self {
-            transition: Transition::new(model, prior.shape())?,
+            prediction: Prediction::known(model, &prior, false)?,
             belief: prior,
         })
     }
@@ -35,10 +36,7 @@ impl Estimator for Oracle {
     }
 
     fn predict(&mut self) {
-        let mut next = Probabilities::zeros(self.belief.view().dim());
-        let belief = self.belief.probabilities_mut();
-        self.transition.apply(belief, &mut next);
-        *belief = next;
+        self.prediction.predict(&mut self.belief);
     }
 
     fn belief(&self) -> &Belief {

@@ -32,10 +32,10 @@ impl Planes {
         (row + self.margin[0]) * self.stride + col + self.margin[1]
     }
 
-    /// Returns the offset from a cell's index to a neighbour's index, given the neighbour's row and column in the
-    /// kernel.
-    pub fn offset(&self, [row, col]: [usize; 2]) -> isize {
-        (row * self.stride + col) as isize - self.place([0, 0]) as isize
+    /// Returns the offset from a cell's index to a neighbour's index, given the neighbour's row and column relative to
+    /// the cell.
+    pub fn offset(&self, [row, col]: [isize; 2]) -> isize {
+        row * self.stride as isize + col
     }
 
     /// Copies a belief, shape `[S, H, W]`, into the planes of its S states. Margins keep their values.

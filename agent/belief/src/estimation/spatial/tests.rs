@@ -41,7 +41,7 @@ fn corrections_agree_with_an_independent_implementation() {
         let first: Array3<f32> = npz.by_name("first_predictor.npy").expect("a predictor");
         let posteriors: Array4<f32> = npz.by_name("post.npy").expect("posteriors");
         let prior = Belief::from_probabilities(first).expect("a belief");
-        let filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid");
+        let filter = BayesFilter::known(&Model::wildfire(), prior, false).expect("valid");
         let mut filter = SpatialFilter::new(filter, FIRE, Correlations::of_table(&table));
         // The test vectors start after the first prediction.
         filter.ages.grow();
@@ -67,7 +67,7 @@ fn an_impossible_frame_changes_nothing_with_or_without_spread() {
     // The observation of cell 0 is possible. The observation of cell 2 is not: the cell is certainly normal, and this
     // model never shows a normal cell as fire.
     let frame = Frame::from_bytes(shape(2, 2), 3, &[2, 255, 2, 2]).expect("a frame");
-    let filter = BayesFilter::known(&model, prior).expect("valid");
+    let filter = BayesFilter::known(&model, prior, false).expect("valid");
     for neighbours in [None, Some((FIRE, Correlations::default()))] {
         let mut filter = correcting(filter.clone(), neighbours);
         let before = filter.handover().expect("a filter").to_bytes();
@@ -84,7 +84,7 @@ fn a_tiny_probability_does_not_count_as_zero() {
     let model = wildfire(|file| file.states[FIRE].observed_as = vec![0.0, 0.02, 0.98]);
     let prior = ndarray::arr3(&[[[1e-9]], [[0.0]], [[1.0]]]);
     let prior = Belief::from_probabilities(prior).expect("a belief");
-    let filter = BayesFilter::known(&model, prior).expect("valid");
+    let filter = BayesFilter::known(&model, prior, false).expect("valid");
     let mut filter = SpatialFilter::new(filter, FIRE, Correlations::default());
     let frame = Frame::from_bytes(shape(1, 1), 3, &[0]).expect("a frame");
     filter.correct(&frame).expect("possible");
@@ -116,7 +116,7 @@ proptest! {
         let (shape, model) = (shape(height, width), model(paying));
         let new = || {
             let prior = Belief::uniform(model.n_states(), shape);
-            let filter = BayesFilter::known(&model, prior).expect("valid");
+            let filter = BayesFilter::known(&model, prior, false).expect("valid");
             SpatialFilter::new(filter, model.target_state(), Correlations::default())
         };
         let mut filter = new();

@@ -36,7 +36,7 @@ fn visited_cells_are_certain_until_the_next_step() {
 
 fn filter() -> Box<dyn Estimator> {
     let model = emberwatch_model::Model::wildfire();
-    let filter = BayesFilter::known(&model, Belief::uniform(3, shape()));
+    let filter = BayesFilter::known(&model, Belief::uniform(3, shape()), false);
     Box::new(filter.expect("a filter"))
 }
 

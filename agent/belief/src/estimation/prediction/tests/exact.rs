@@ -1,9 +1,9 @@
 //! The exact Bayes filter of a small grid: it enumerates the joint states of all cells.
 
-use super::{KINDS, predict, random};
+use super::{formula, random};
 use crate::estimation::belief::Belief;
-use crate::estimation::prediction::{Prediction, Weights};
-use emberwatch_model::{Grid, Shape};
+use crate::estimation::prediction::Prediction;
+use emberwatch_model::{Grid, Model, Shape};
 
 /// The probability of each joint state of a small grid.
 #[derive(Clone)]
@@ -27,25 +27,19 @@ fn likelihood(state: usize, value: usize) -> f64 {
 
 impl Exact {
     /// Creates the filter of a grid with cell 0 in state 1 and all other cells in state 0.
-    fn new(shape: Shape, weights: Weights<'_>) -> Self {
+    fn new(shape: Shape, model: &Model) -> Self {
         let n = 3_usize.pow(shape.n_cells() as u32);
         let next = |joint: usize| {
-            let cell = |index: usize| {
-                let (cell, own) = (shape.cell(index), state(joint, index));
-                let mut sums = [0, 1, 2].map(|m| weights.bias[m]);
-                let kernel = &weights.kernels[own % weights.kernels.len()];
-                for (a, c) in (0..9).map(|at| (at / 3, at % 3)) {
-                    let row = (cell.row + a).wrapping_sub(1);
-                    let col = (cell.col + c).wrapping_sub(1);
-                    if row < shape.height() && col < shape.width() {
-                        let n = state(joint, row * shape.width() + col);
-                        (0..3).for_each(|m| sums[m] += kernel[[m, n, a, c]]);
-                    }
-                }
-                let total: f64 = sums.iter().sum();
-                sums.map(|weight| weight / total)
-            };
-            (0..shape.n_cells()).map(cell).collect()
+            // If all states are certain, the formula is exact.
+            let states = (0..shape.n_cells())
+                .map(|cell| state(joint, cell) as u8)
+                .collect();
+            let states = Grid::from_shape_vec(shape.dim(), states).expect("a grid");
+            let next = formula(model, &Belief::from_states(&states, 3).expect("states"));
+            let cells = (0..shape.n_cells()).map(|index| shape.cell(index));
+            cells
+                .map(|cell| [0, 1, 2].map(|m| next[[m, cell.row, cell.col]]))
+                .collect()
         };
         let mut joint = vec![0.0; n];
         joint[1] = 1.0;
@@ -108,19 +102,20 @@ impl Exact {
     }
 }
 
-/// Simulates worlds whose first cell starts in state 1. For each kind of prediction, returns the Kullback-Leibler
-/// divergence of the beliefs from the exact beliefs, as the mean over steps and cells. Frames show each cell with
+/// Simulates worlds whose first cell starts in state 1. For predictions without and with cavities, returns the
+/// Kullback-Leibler divergence of the beliefs from the exact beliefs, as the mean over steps and cells. Frames show each cell with
 /// probability `1 / one_in`. If `one_in` is 0, frames show no cells.
-pub fn divergences(weights: Weights<'_>, shape: Shape, one_in: u64, n_worlds: u64) -> [f64; 3] {
+pub fn divergences(model: &Model, shape: Shape, one_in: u64, n_worlds: u64) -> [f64; 2] {
     let mut states = Grid::zeros(shape.dim());
     states[[0, 0]] = 1;
-    let start = Exact::new(shape, weights);
-    let mut sums = [0.0; 3];
+    let start = Exact::new(shape, model);
+    let mut sums = [0.0; 2];
     for world in 0..n_worlds {
         let (mut exact, mut truth) = (start.clone(), 1);
-        let mut followed = KINDS.map(|kind| {
+        let mut followed = [false, true].map(|cavities| {
             let belief = Belief::from_states(&states, 3).expect("states");
-            (Prediction::new(weights, kind, &belief), belief)
+            let prediction = Prediction::known(model, &belief, cavities);
+            (prediction.expect("fits"), belief)
         });
         let mut n_drawn = 0;
         let mut random = || {
@@ -131,7 +126,7 @@ pub fn divergences(weights: Weights<'_>, shape: Shape, one_in: u64, n_worlds: u6
             truth = exact.draw(truth, &mut random);
             exact.predict();
             for ((prediction, belief), sum) in followed.iter_mut().zip(&mut sums) {
-                predict(prediction, belief);
+                prediction.predict(belief);
                 *sum += exact.divergence_of(belief);
             }
             let seen = observe(truth, shape, one_in, &mut random);
