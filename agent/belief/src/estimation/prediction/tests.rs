@@ -215,15 +215,15 @@ fn an_edge_state_equals_a_border_of_cells_in_that_state() {
 fn cavities_are_closer_to_the_exact_filter() {
     // Bounds are 10 % above the measured values.
     for (dim, one_in, n_worlds, bounds) in [
-        ((2, 3), 0, 1, [0.0, 0.0]),
-        ((2, 3), 5, 40, [0.0, 0.0]),
-        ((2, 3), 1, 40, [0.0, 0.0]),
-        ((3, 3), 0, 1, [0.0, 0.0]),
+        ((2, 3), 0, 1, [0.097, 0.065]),
+        ((2, 3), 5, 40, [0.163, 0.106]),
+        ((2, 3), 1, 40, [0.0065, 0.006]),
+        ((3, 3), 0, 1, [0.119, 0.080]),
     ] {
         let off = divergences(&model(FIRE), shape(dim.0, dim.1), one_in, n_worlds);
-        eprintln!("{dim:?} {one_in} {off:?}");
+        assert!(off[0] > off[1], "{dim:?} {off:?}");
         let within = off.iter().zip(bounds).all(|(off, bound)| *off < bound);
-        let _ = within;
+        assert!(within, "{dim:?} one in {one_in}: {off:?}");
     }
 }
 
