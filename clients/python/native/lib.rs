@@ -3,7 +3,6 @@
 mod airspace;
 mod answer;
 mod backend;
-mod belief;
 mod connection;
 mod detached;
 mod errors;
@@ -20,6 +19,7 @@ mod origin;
 mod owned;
 mod planned_worlds;
 mod planning;
+mod prior;
 mod reader;
 mod recording;
 mod refusal;
@@ -54,7 +54,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<reader::Truths>()?;
     module.add_class::<reader::Outlooks>()?;
     module.add_class::<recording::Recording>()?;
-    module.add_class::<belief::Transition>()?;
     module.add_class::<estimators::Estimators>()?;
     module.add_class::<merit::MeritTally>()?;
     module.add_class::<options::Options>()?;
@@ -65,8 +64,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<backend::CheckedSettings>()?;
     module.add_function(wrap_pyfunction!(backend::model_text, module)?)?;
     module.add_function(wrap_pyfunction!(backend::read_again, module)?)?;
-    module.add_function(wrap_pyfunction!(belief::correct, module)?)?;
-    module.add_function(wrap_pyfunction!(belief::simulated_prior, module)?)?;
+    module.add_function(wrap_pyfunction!(prior::simulated_prior, module)?)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;
     module.add("FIRST_TRAINING_SEED", FIRST_TRAINING_SEED)?;
     module.add("MAX_MOVES", MAX_MOVES)?;

@@ -1,13 +1,13 @@
 //! Options for Python: beliefs about worlds of one robot each, and the plans that a learner chooses from.
 
 use crate::airspace::Given;
-use crate::belief::first_belief;
 use crate::connection::checked;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
 use crate::origin::decoded;
 use crate::owned::Owned;
 use crate::planned_worlds::{Observed, PlannedWorlds, Watched};
+use crate::prior::first_belief;
 use crate::refusal::{invalid, refused};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Prior;

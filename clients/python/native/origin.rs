@@ -1,7 +1,7 @@
 //! The sources that beliefs are built from: a model and a first belief, or a checkpoint.
 
-use crate::belief::vanishing;
 use crate::errors::check_memory;
+use crate::prior::vanishing;
 use crate::refusal::{invalid, refused};
 use crate::threads::Pool;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};

@@ -27,7 +27,7 @@ from failures import refuses
 from gymnasium.utils.env_checker import check_env
 
 from emberwatch._native import Flights, built_in
-from emberwatch.belief import Transition, known
+from emberwatch.belief import known
 from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace
@@ -216,16 +216,17 @@ def test_the_filter_uses_zones() -> None:
     text = land.model(radius=2, zone_map=zones)
     model, expected = Model.from_toml(text), oracle.parameters(text)
     belief = np.moveaxis(rng.dirichlet(np.ones(3), SHAPE), -1, 0)
-    phi = Transition(model, height=7, width=5).apply(belief)
-    np.testing.assert_allclose(phi, oracle.phi(expected, belief), atol=1e-12)
-    assert np.allclose(phi[:, zones == 1], belief[:, zones == 1])
     frame = rng.choice(np.array([*range(3), 255], np.uint8), SHAPE)
     kept = known(model, prior=belief)
     kept.correct(frame)
-    np.testing.assert_allclose(kept.belief, oracle.bayes(expected, belief, frame), atol=1e-6)
+    posterior = kept.belief
+    np.testing.assert_allclose(posterior, oracle.bayes(expected, belief, frame), atol=1e-6)
+    kept.predict()
+    np.testing.assert_allclose(kept.belief, oracle.phi(expected, posterior), atol=1e-6)
+    assert np.allclose(kept.belief[:, zones == 1], posterior[:, zones == 1])
     assert simulated_prior(model, height=7, width=5, burn_in=20).shape == (3, 7, 5)
     with refuses("model: zone_map: expected a map of the 5 x 5 grid, got 7 x 5"):
-        Transition(model, height=5, width=5).apply(np.full((3, 5, 5), 1 / 3))
+        known(model, prior=np.full((3, 5, 5), 1 / 3))
 
 
 def test_beam_search_respects_the_airspace() -> None:

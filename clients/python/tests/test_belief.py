@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from emberwatch.belief import (
     UNOBSERVED,
-    Filters,
-    Transition,
     entropy,
     initial_prior,
     known,
@@ -55,11 +53,6 @@ def assert_near(got: NDArray, expected: NDArray, tolerance: float) -> None:
 
 
 def test_beliefs_equal_the_authors_numbers() -> None:
-    file = golden("a1_transition")
-    states, belief = np.moveaxis(np.eye(3)[file["4x7_state"]], -1, 0), file["4x7_prob"]
-    transition = Transition(WILDFIRE, height=4, width=7)
-    assert_near(transition.apply(states), file["4x7_phi_state"], 1e-6)
-    assert_near(transition.apply(belief.astype(np.float64)), file["4x7_phi_prob"], 1e-6)
     file = golden("a3_bayes")
     saved = file["7x4_saved_steps"].tolist()
     filter = known(WILDFIRE, prior=uniform_prior(WILDFIRE, height=7, width=4))
@@ -93,33 +86,24 @@ def test_beliefs_equal_the_oracle_and_stay_on_the_simplex(
 ) -> None:
     rng = np.random.default_rng(key)
     prior = initial_prior(model, height=height, width=width)
-    filter, filters = known(model, prior=prior), Filters(model, prior, 1)
-    parameters = oracle.parameters(model.toml)
-    filters.reset([0], np.full((1, height, width), UNOBSERVED, np.uint8))
-    filter.predict()
+    filter, parameters = known(model, prior=prior), oracle.parameters(model.toml)
     for _ in range(5):
         frame = rng.integers(0, model.n_observations, (height, width)).astype(np.uint8)
         frame[rng.random((height, width)) < 0.5] = UNOBSERVED
-        before, exactly = filter.belief, filters.predictor[:, 0].copy()
+        before = filter.belief
         filter.correct(frame)
-        filters.update(frame[np.newaxis], np.ones(1, np.bool_))
         after = filter.belief
         assert (after[:, frame == UNOBSERVED] == before[:, frame == UNOBSERVED]).all()
         assert_near(after, oracle.bayes(parameters, before, frame), 1e-6)
-        assert_near(filters.posterior[:, 0], oracle.bayes(parameters, exactly, frame), 1e-14)
         filter.predict()
         assert_near(filter.belief, oracle.phi(parameters, after), 1e-6)
-        expected = oracle.phi(parameters, filters.posterior[:, 0])
-        assert_near(filters.predictor[:, 0], expected, 1e-12)
         for belief in (after, filter.belief):
             assert (belief >= 0).all()
             assert_near(belief.sum(axis=0), np.ones((height, width)), 1e-6)
         assert_near(filter.entropy(), entropy(filter.belief.astype(np.float64)), 1e-6)
 
 
-def test_wrong_shapes_and_vanishing_models_are_refused() -> None:
-    with refuses(r"belief: expected shape \(3, 2, 2\)"):
-        Transition(WILDFIRE, height=2, width=2).apply(np.ones((3, 2, 3)))
+def test_vanishing_models_are_refused() -> None:
     model = model_of(kernel=np.zeros((2, 2, 1, 1)), bias=np.zeros(2), matrix=np.ones((2, 1)))
     with refuses(r"cell \(0, 0\): expected a positive sum"):
         known(model, prior=uniform_prior(model, height=2, width=2))

@@ -80,8 +80,8 @@ CASES = {
     **{f"objective, neural, {n} worlds":
        (make_vec("WildfireObjective-v1", n, checkpoint=f"{FOLDER}/neural_belief"), act)
        for n in (1, 2)},
-    "paths": (make_vec("Wildfire-v0", 3), act),
-    "moves": (make_vec("WildfireMoves-v0", 3), act),
+    "paths": (make_vec("Wildfire-v0", 3, observation="belief"), act),
+    "moves": (make_vec("WildfireMoves-v0", 3, observation="local"), act),
     "team": (lambda: emberwatch.parallel_env(action="path", robots=2, **WORLD), act),
 }
 assert {name.partition(",")[0] for name in CASES} >= set(belief.kinds())

@@ -35,9 +35,13 @@ Make = Callable[..., Any]
 
 @pytest.fixture(
     params=[
-        partial(making, name)
+        partial(making, name, **keywords)
         for making in (make, partial(make_vec, 2))
-        for name in (WILDFIRE, MOVES, OBJECTIVE)
+        for name, keywords in (
+            (WILDFIRE, {}),
+            (MOVES, {"observation": ("belief", "local")}),
+            (OBJECTIVE, {}),
+        )
     ],
     ids=[f"{kind} {many}" for many in ("alone", "vector") for kind in ("path", "move", "option")],
 )

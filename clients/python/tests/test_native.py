@@ -12,7 +12,7 @@ from failures import fails, refuses
 from processes import LONG, asleep, eventually, script, server
 
 from emberwatch import _native, errors
-from emberwatch.belief import Transition, initial_prior
+from emberwatch.belief import known, uniform_prior
 from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Model
 
@@ -62,21 +62,6 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
         client.status()
 
 
-def test_bayes_rule_refuses_invalid_beliefs() -> None:
-    likelihood, frames = WILDFIRE.observation_matrix, np.zeros((1, 2, 2), np.uint8)
-    beliefs = np.full((3, 1, 2, 2), 1 / 3)
-    with refuses(r"belief: expected shape \(0, 1, 2, 2\)"):
-        _native.correct(beliefs[:0], likelihood[:0], frames)
-    frozen = beliefs.copy()
-    frozen.flags.writeable = False
-    with refuses("belief: expected a writable array"):
-        _native.correct(frozen, likelihood, frames)
-    beliefs[0, 0, 1, 0] = np.nan
-    with fails("impossible_frame", match=r"cell \(1, 0\): .* the belief \[NaN"):
-        _native.correct(beliefs, likelihood, frames)
-    assert beliefs[0, 0, 0, 0] == 1 / 3
-
-
 def test_a_lease_refuses_robots_of_others() -> None:
     lease = server(worlds=4).connect().acquire(1, 2)
     for first, n in ((0, 1), (2, 2), (0, 4), (2**32 - 1, 1)):
@@ -94,25 +79,19 @@ def test_numbers_out_of_range_are_refused() -> None:
     ):
         with refuses(words):
             simulated_prior(WILDFIRE, **right | wrong)
-    for height in (0, 4097):
-        with refuses(f"grid: expected height and width within 1 to 4096, got {height} x 3"):
-            Transition(WILDFIRE, height=height, width=3)
+    with refuses("grid: expected height and width within 1 to 4096, got 4097 x 3"):
+        known(WILDFIRE, prior=uniform_prior(WILDFIRE, height=4097, width=3))
     values, robots = np.zeros((1, 2, 2), np.float32), np.zeros((1, 2), int)
     with refuses("n_moves: expected an integer within 1 to 4096, got 4097"):
         _native.beam_search(values, robots, np.zeros(1, np.uint64), 4097, 1)
 
 
 def test_other_threads_run_during_work_on_large_grids() -> None:
-    prior = initial_prior(WILDFIRE, height=600, width=600)
-    beliefs, frames = np.repeat(prior[:, np.newaxis], 2, axis=1), np.zeros((2, 600, 600), np.uint8)
-    phi = _native.Transition(WILDFIRE.toml, 600, 600)
-    meets(
-        lambda: phi.apply(beliefs),
-        errors.InvalidArgumentError,
-        "filter that no other thread is using",
-    )
-    correct = partial(_native.correct, beliefs, WILDFIRE.observation_matrix, frames)
-    meets(correct, errors.InvalidArgumentError, "in use")
+    prior = uniform_prior(WILDFIRE, height=600, width=600)
+    kept = known(WILDFIRE, prior=prior, n_worlds=2)
+    frames = np.zeros(kept.shape, np.uint8)
+    for work in (kept.predict, partial(kept.correct, frames)):
+        meets(work, errors.InvalidArgumentError, "belief that no other thread is using")
 
 
 def meets(work: Callable[[], object], kind: type[Exception], words: str) -> None:

@@ -21,7 +21,7 @@ from environments import (
 )
 from failures import refuses
 
-from emberwatch.belief import Transition, entropy
+from emberwatch.belief import entropy, known
 from emberwatch.envs.observations import Observations
 from emberwatch.wrappers import BeliefObservation
 
@@ -48,11 +48,11 @@ def test_the_belief_part_is_the_filters_prediction(name: str) -> None:
     env, filtered = make(name, observation="belief"), BeliefObservation(make(name))
     seen = [env.reset(seed=5)[0], *(env.step(action)[0] for action in actions(env, 9))]
     filtered.reset(seed=5)
-    transition = Transition(filtered.unwrapped.model, height=7, width=5)
     for number, action in enumerate(actions(env, 9), 1):
-        filtered.step(action)
-        predictor = transition.apply(filtered.filter.belief)
-        assert np.array_equal(seen[number], np.rint(255 * predictor.transpose(1, 2, 0)))
+        posterior = filtered.step(action)[0]
+        predictor = known(filtered.unwrapped.model, prior=posterior)
+        predictor.predict()
+        assert np.array_equal(seen[number], np.rint(255 * predictor.belief.transpose(1, 2, 0)))
     assert not np.array_equal(seen[0], seen[9])
 
 

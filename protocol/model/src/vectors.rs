@@ -5,6 +5,9 @@ use pulp::{Arch, Simd, WithSimd};
 /// Number of cells computed at once: four AVX2 registers of `f32`. Independent sums hide the latency of additions.
 pub const LANES: usize = 32;
 
+/// One number for each of [`LANES`] cells.
+pub type Lanes = [f32; LANES];
+
 /// Runs `work`, compiled for AVX-512, AVX2 or plain vectors, depending on what the processor supports. No operation is
 /// fused, so all variants return the same results.
 ///

@@ -38,7 +38,7 @@ pub fn model(bytes: &[u8]) -> bool {
     let grids = [(1, 1), (2, 5), (3, 17)].map(|(height, width)| Shape::new(height, width));
     for shape in grids.into_iter().flatten() {
         let fits = model.check_on(shape).is_ok();
-        let transition = Transition::<f32>::new(&model, shape);
+        let transition = Transition::new(&model, shape);
         let dynamics = Dynamics::new(&model, shape);
         assert_eq!((transition.is_ok(), dynamics.is_ok()), (fits, fits));
         if let (Ok(transition), Ok(dynamics)) = (transition, dynamics) {
@@ -51,7 +51,7 @@ pub fn model(bytes: &[u8]) -> bool {
 }
 
 /// Checks that predictions from one-hot beliefs and from the uniform belief are valid beliefs.
-fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition<f32>) {
+fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition) {
     let dim = (model.n_states(), shape.height(), shape.width());
     let mut next = Array3::zeros(dim);
     for certain in 0..=dim.0 {

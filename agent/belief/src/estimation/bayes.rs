@@ -2,8 +2,8 @@
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::grid::Probabilities;
-use emberwatch_model::{Cell, Frame, Shape};
-use ndarray::{Array2, NdFloat};
+use emberwatch_model::{Cell, Frame};
+use ndarray::Array2;
 use thiserror::Error;
 
 /// The error about an observation that is impossible under the belief.
@@ -16,25 +16,6 @@ pub struct ZeroEvidence {
     pub observed: u8,
     /// The belief about the cell, one probability per state.
     pub belief: Vec<f32>,
-}
-
-/// The same error as [`ZeroEvidence`], but with the cell's row-major index and probabilities of any float type.
-#[derive(Debug, PartialEq)]
-pub struct Impossible<T> {
-    pub index: usize,
-    pub observed: u8,
-    /// The belief about the cell, one probability per state.
-    pub belief: Vec<T>,
-}
-
-impl ZeroEvidence {
-    fn of(impossible: Impossible<f32>, shape: Shape) -> Self {
-        Self {
-            cell: shape.cell(impossible.index),
-            observed: impossible.observed,
-            belief: impossible.belief,
-        }
-    }
 }
 
 /// Computes the distribution of each cell's observation under a belief, `B' u`, shape `[O, H, W]`. `likelihood` is
@@ -67,11 +48,22 @@ pub fn correct(
     likelihood: &Array2<f64>,
     frame: &Frame,
 ) -> Result<(), ZeroEvidence> {
-    let shape = belief.shape();
     let dim = frame.values().dim();
-    assert_eq!(dim, shape.dim(), "frame: expected the belief's grid");
-    let corrected = correct_cells(belief.as_mut_slice(), likelihood, || frame.observed());
-    corrected.map_err(|impossible| ZeroEvidence::of(impossible, shape))
+    assert_eq!(
+        dim,
+        belief.shape().dim(),
+        "frame: expected the belief's grid"
+    );
+    // Posteriors are written only after all observations have proved possible.
+    let posteriors = posteriors(belief, likelihood, frame)?;
+    let n_cells = belief.shape().n_cells();
+    let probabilities = belief.as_mut_slice();
+    let posteriors = posteriors.chunks_exact(likelihood.nrows());
+    for ((index, _), posterior) in frame.observed().zip(posteriors) {
+        let cell = probabilities[index..].iter_mut().step_by(n_cells);
+        cell.zip(posterior).for_each(|(to, &p)| *to = p);
+    }
+    Ok(())
 }
 
 /// Checks that [`correct`] accepts a frame.
@@ -79,61 +71,34 @@ pub fn correct(
 /// # Errors
 /// [`ZeroEvidence`] if `b(y)' u = 0` for some cell.
 pub fn check(belief: &Belief, likelihood: &Array2<f64>, frame: &Frame) -> Result<(), ZeroEvidence> {
-    let posteriors = posteriors(belief.as_slice(), likelihood, frame.observed());
-    let possible = posteriors.map(drop);
-    possible.map_err(|impossible| ZeroEvidence::of(impossible, belief.shape()))
-}
-
-/// Applies Bayes' rule as [`correct`] does, but to any list of cells. `probabilities` contains one contiguous block of
-/// cells per state. `observed` lists the index and the value of each observed cell.
-///
-/// # Errors
-/// [`Impossible`] for the first cell where `b(y)' u` is 0 or not finite. The probabilities are then unchanged.
-///
-/// # Panics
-/// If a cell or a value is out of range.
-pub fn correct_cells<T: NdFloat, I: Iterator<Item = (usize, u8)>>(
-    probabilities: &mut [T],
-    likelihood: &Array2<f64>,
-    observed: impl Fn() -> I,
-) -> Result<(), Impossible<T>> {
-    let n_states = likelihood.nrows();
-    let n_cells = probabilities.len() / n_states;
-    // Posteriors are written back only after all observations have proved possible.
-    let posteriors = posteriors(probabilities, likelihood, observed())?;
-    for ((index, _), posterior) in observed().zip(posteriors.chunks_exact(n_states)) {
-        let cell = probabilities[index..].iter_mut().step_by(n_cells);
-        cell.zip(posterior).for_each(|(to, &p)| *to = p);
-    }
-    Ok(())
+    posteriors(belief, likelihood, frame).map(drop)
 }
 
 /// Returns the posterior of each observed cell, one cell after another.
-fn posteriors<T: NdFloat>(
-    probabilities: &[T],
+fn posteriors(
+    belief: &Belief,
     likelihood: &Array2<f64>,
-    observed: impl Iterator<Item = (usize, u8)>,
-) -> Result<Vec<T>, Impossible<T>> {
-    let n_cells = probabilities.len() / likelihood.nrows();
-    let mut posteriors: Vec<T> = Vec::new();
-    for (index, observed) in observed {
-        let prior = probabilities[index..].iter().step_by(n_cells);
+    frame: &Frame,
+) -> Result<Vec<f32>, ZeroEvidence> {
+    let n_cells = belief.shape().n_cells();
+    let mut posteriors = Vec::new();
+    for (index, observed) in frame.observed() {
+        let prior = belief.as_slice()[index..].iter().step_by(n_cells);
         let likelihood = likelihood.column(usize::from(observed));
         // Compute in f64, because the product of two f32 values can underflow to zero in f32, but not in f64.
         let joint = || {
             let pairs = prior.clone().zip(&likelihood);
-            pairs.map(|(&u, b)| u.to_f64().unwrap_or(f64::NAN) * b)
+            pairs.map(|(&u, b)| f64::from(u) * b)
         };
         let evidence: f64 = joint().sum();
         if evidence <= 0.0 || !evidence.is_finite() {
-            return Err(Impossible {
-                index,
+            return Err(ZeroEvidence {
+                cell: belief.shape().cell(index),
                 observed,
                 belief: prior.copied().collect(),
             });
         }
-        let posterior = joint().map(|p| T::from(p / evidence).unwrap_or_else(T::nan));
-        posteriors.extend(posterior);
+        posteriors.extend(joint().map(|p| (p / evidence) as f32));
     }
     Ok(posteriors)
 }

@@ -453,16 +453,6 @@ def description_with_radius(text: str, radius: int) -> str:
 def read_description(text: str) -> dict[str, Any]:
     """Returns the fields of `Description` except `toml`; `ValueError` if the text is invalid."""
 
-@final
-class Transition:
-    """The operator ``Phi`` of a model (text of its file) on one grid. Reuses scratch memory."""
-
-    def __new__(cls, model: str, height: int, width: int) -> Transition: ...
-    def apply(self, beliefs: _Doubles) -> _Doubles:
-        """Returns ``Phi`` of beliefs `(S, n, H, W)` as a new array."""
-
-    def __getnewargs__(self) -> tuple[str, int, int]: ...
-
 class Estimators:
     """Beliefs of one kind about n worlds; `Belief` checks the arguments.
 
@@ -514,9 +504,6 @@ class Estimators:
 
 def belief_kinds() -> list[tuple[str, str]]:
     """Returns the name and a description of each kind of belief that frames can correct."""
-
-def correct(beliefs: _Doubles, likelihood: _Doubles, frames: NDArray[np.uint8]) -> None:
-    """Applies Bayes' rule to `beliefs` in place; shapes `(S, n, H, W)`, `(S, O)`, `(n, H, W)`."""
 
 def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
     """Returns the share of 64 simulated worlds with each cell in each state, `(S, H, W)`."""

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch._native import Flights, Windows
-from emberwatch.belief import Filters
+from emberwatch.belief import Belief, known
 from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
 from emberwatch.common.arguments import as_integer
@@ -77,7 +77,7 @@ class Observations:
         )
         grid = (spec.height, spec.width, spec.n_observations)
         self._last_seen = LastSeen(n_rows, *grid) if _OF_MEMORY & set(names) else None
-        self._filters: Filters | None = None
+        self._belief: Belief | None = None
         channels = {"local": N_OF_BELIEF, "recent": spec.n_observations}
         self._windows = {
             name: Windows(n_rows, spec.height, spec.width, window, channels[name], spec.airspace)
@@ -86,9 +86,13 @@ class Observations:
         }
         #: Whether the last frame alone determines the observation.
         self._has_no_memory = not (OF_BELIEF | _OF_MEMORY) & set(names)
-        self._beliefs = np.empty(0, np.uint8)
+        self._image = np.empty(0, np.uint8)
         # One row for each observed value, and a last row for unobserved cells.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Omits the belief from copies, because their next episode begins with the prior."""
+        return {**vars(self), "_belief": None}
 
     def begin(
         self, begun: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
@@ -126,8 +130,10 @@ class Observations:
         if self._last_seen is not None:
             self._last_seen.reset(begun, frames)
         if OF_BELIEF & set(self._names):
-            self._filters = self._filters or self._first_beliefs()
-            self._filters.reset(np.flatnonzero(begun).tolist(), frames)
+            self._belief = self._belief or self._first_belief()
+            self._belief.reset(begun)
+            self._belief.correct(frames, begun)
+            self._belief.predict(begun)
         self._show(begun)
 
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
@@ -136,8 +142,9 @@ class Observations:
             return
         if self._last_seen is not None:
             self._last_seen.update(moved, frames)
-        if self._filters is not None:
-            self._filters.update(frames, moved)
+        if self._belief is not None:
+            self._belief.correct(frames, moved)
+            self._belief.predict(moved)
         self._show(moved)
 
     def visit(self, moved: NDArray[np.bool_]) -> None:
@@ -200,8 +207,8 @@ class Observations:
             return self._others(robots if teams is None else cells_of(teams.robots))
         if self._last_seen is not None and name == "age":
             return self._last_seen.ages[..., np.newaxis].copy()
-        if self._filters is not None and name == "belief":
-            return self._beliefs.copy()
+        if name == "belief":
+            return self._image.copy()
         assert self._flights is not None
         if name in self._windows:
             return self._windows[name].around(self._flights)
@@ -222,22 +229,23 @@ class Observations:
         shown[rows, cells[:, 0], cells[:, 1]] = 255
         return shown
 
-    def _first_beliefs(self) -> Filters:
+    def _first_belief(self) -> Belief:
         spec = self._spec
         assert spec.model is not None
         grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
-        return Filters(spec.model, prior_of(None, spec.model, **grid), self._n_rows)
+        prior = prior_of(None, spec.model, **grid)
+        return known(spec.model, prior=prior, n_worlds=self._n_rows)
 
     def _show(self, rows: NDArray[np.bool_]) -> None:
         """Updates the beliefs and windows of `rows`, in which a new path begins."""
-        if self._filters is not None and "belief" in self._names:
-            beliefs = np.rint(255.0 * self._filters.predictor.transpose(1, 2, 3, 0))
-            self._beliefs = beliefs.astype(np.uint8)
+        if self._belief is not None and "belief" in self._names:
+            image = np.rint(255.0 * self._belief.belief.transpose(1, 2, 3, 0))
+            self._image = image.astype(np.uint8)
         for name, windows in self._windows.items():
             if name == "recent" and self._last_seen is not None:
                 windows.begin(rows, self._last_seen.fading(rows))
-            elif self._filters is not None and self._spec.model is not None:
-                windows.begin(rows, of_belief(self._spec.model, self._filters, rows))
+            elif self._belief is not None:
+                windows.begin(rows, of_belief(self._belief, rows))
 
 
 def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:

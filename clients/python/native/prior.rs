@@ -1,0 +1,100 @@
+//! Priors: beliefs before the first frame, and their simulation.
+
+use crate::errors::{check_memory, no_threads};
+use crate::model::{model_of, shape_of};
+use crate::refusal::{failed, invalid};
+use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
+use emberwatch_messages::limits::threads::NoThreads;
+use emberwatch_model::{Model, ModelError, Shape};
+use numpy::{PyArray3, ToPyArray};
+use pyo3::prelude::*;
+use rayon::ThreadPoolBuilder;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+/// Time between two checks for Ctrl-C in a long computation.
+const LOOK: Duration = Duration::from_millis(2);
+
+/// Simulates 64 worlds. Returns the share of worlds in which each cell is in each state after the burn-in, `[S, H, W]`.
+#[pyfunction]
+pub fn simulated_prior<'py>(
+    py: Python<'py>,
+    model: &str,
+    height: usize,
+    width: usize,
+    burn_in: u64,
+) -> PyResult<Bound<'py, PyArray3<f32>>> {
+    let (model, shape) = (model_of(model)?, shape_of(py, height, width)?);
+    let n_worlds = Prior::N_WORLDS;
+    let prior = Prior::Simulated { n_worlds, burn_in };
+    let belief = first_belief(py, prior, &model, shape)?;
+    Ok(belief.probabilities().to_pyarray(py))
+}
+
+/// Returns the belief before the first frame. Caches a simulated belief in a file for other processes. Ctrl-C ends the
+/// wait for another process that simulates it.
+pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
+    let is_simulated = matches!(prior, Prior::Simulated { .. });
+    let kept = is_simulated.then(|| KeptBelief::new(prior, model, shape, 0));
+    let pause = |time| {
+        py.detach(|| std::thread::sleep(time));
+        py.check_signals()
+    };
+    let make = || simulated(py, prior, model, shape);
+    match kept.flatten() {
+        Some(kept) => kept.read_or_make(pause, make),
+        None => make(),
+    }
+}
+
+/// Simulates a prior on new threads, because a global pool is unusable after a fork. Ctrl-C ends the simulation.
+fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
+    let cancelled = AtomicBool::new(false);
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    // Each thread simulates one world at a time, and counts for each cell how often each state occurs.
+    let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
+    let n_bytes = 2 * n_threads * of_thread;
+    check_memory(py, "the worlds of a first belief", n_bytes)?;
+    let pool = emberwatch_sim::limits::start(ThreadPoolBuilder::new(), n_threads);
+    let pool = pool.map_err(|short| no_threads(py, &short))?;
+    let simulated = std::thread::scope(|scope| {
+        let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));
+        let worker = std::thread::Builder::new().spawn_scoped(scope, work);
+        let worker = worker.map_err(|error| no_threads(py, &NoThreads::new(1, &error)))?;
+        while !worker.is_finished() {
+            py.detach(|| std::thread::sleep(LOOK));
+            if let Err(interrupt) = py.check_signals() {
+                cancelled.store(true, Ordering::Relaxed);
+                return Err(interrupt);
+            }
+        }
+        Ok(worker.join())
+    })?;
+    match simulated {
+        Ok(Ok(Some(belief))) => Ok(belief),
+        Ok(Err(error)) => Err(vanishing(py, &error)),
+        Ok(Ok(None)) | Err(_) => Err(failed(
+            py,
+            "the first belief could not be simulated",
+            "program",
+        )),
+    }
+}
+
+/// Creates the exception for a model whose transition weights can all be 0, or can lose their precision.
+pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
+    match error {
+        ModelError::ZeroWeight { cell, .. } => {
+            let subject = format!("model: transition weights of cell {cell}");
+            let got = "weights that can all be 0";
+            invalid(py, subject, "a positive sum for every neighbourhood", got)
+        }
+        ModelError::Value {
+            what,
+            expected,
+            got,
+            ..
+        } => invalid(py, format!("model: {what}"), expected, got),
+        other => invalid(py, "model", "weights that keep their precision", other),
+    }
+}
