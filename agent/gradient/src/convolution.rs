@@ -13,68 +13,42 @@ const GROUP: usize = 3;
 /// Number of vectors of cells computed at once.
 const WIDE: usize = 4;
 
-/// A convolution from planes to planes: `to[m] = base[m] + sum_n sum_a w[m, n, a] from[n, . + a]`.
+/// A convolution from planes to planes: `to[m] = sum_n sum_a w[m, n, a] from[n, . + a]`.
 #[derive(Debug, Clone)]
 pub(crate) struct Convolution {
     layout: Layout,
-    n_from: usize,
     /// The weights `w[to, from, row, col]`.
     weights: Vec<f32>,
 }
 
-/// The initial value of the sums.
-#[derive(Debug, Clone, Copy)]
-pub(crate) enum Base<'a> {
-    Zero,
-    /// One value per plane.
-    Biases(&'a [f32]),
-    /// The current values of the planes.
-    Planes,
-}
-
 impl Convolution {
-    pub(crate) fn new(layout: Layout, n_from: usize, weights: Vec<f32>) -> Self {
-        Self {
-            layout,
-            n_from,
-            weights,
-        }
-    }
-
-    pub(crate) fn n_to(&self) -> usize {
-        self.weights.len() / (self.n_from * self.layout.n_taps())
+    pub(crate) fn new(layout: Layout, weights: Vec<f32>) -> Self {
+        Self { layout, weights }
     }
 
     /// Returns the convolution that takes derivatives from `to` back to `from`, with the weights
     /// `w[from, to, KH - 1 - row, KW - 1 - col]`.
     pub(crate) fn turned(&self) -> Self {
-        let (n_from, n_taps) = (self.n_from, self.layout.n_taps());
+        let (n, n_taps) = (self.layout.n_states, self.layout.n_taps());
         let mut turned = Vec::with_capacity(self.weights.len());
-        for from in 0..n_from {
-            for to in 0..self.n_to() {
-                let straight = &self.weights[(to * n_from + from) * n_taps..][..n_taps];
+        for from in 0..n {
+            for to in 0..n {
+                let straight = &self.weights[(to * n + from) * n_taps..][..n_taps];
                 turned.extend(straight.iter().rev());
             }
         }
-        Self::new(self.layout, self.n_to(), turned)
+        Self::new(self.layout, turned)
     }
 
     /// Computes one row of the grid.
     #[inline(always)]
-    pub(crate) fn row<S: Simd>(
-        &self,
-        simd: S,
-        from: &[f32],
-        to: &mut [f32],
-        base: Base<'_>,
-        row: usize,
-    ) {
-        let n_to = self.n_to();
+    pub(crate) fn row<S: Simd>(&self, simd: S, from: &[f32], to: &mut [f32], row: usize) {
+        let n_to = self.layout.n_states;
         for first in (0..n_to).step_by(GROUP) {
             match n_to - first {
-                1 => self.group::<S, 1>(simd, from, to, base, row, first),
-                2 => self.group::<S, 2>(simd, from, to, base, row, first),
-                _ => self.group::<S, GROUP>(simd, from, to, base, row, first),
+                1 => self.group::<S, 1>(simd, from, to, row, first),
+                2 => self.group::<S, 2>(simd, from, to, row, first),
+                _ => self.group::<S, GROUP>(simd, from, to, row, first),
             }
         }
     }
@@ -86,18 +60,17 @@ impl Convolution {
         simd: S,
         from: &[f32],
         to: &mut [f32],
-        base: Base<'_>,
         row: usize,
         first: usize,
     ) {
         let columns = self.layout.columns();
         let mut col = 0;
         while col + WIDE * S::F32_LANES <= columns {
-            self.block::<S, G, WIDE>(simd, from, to, base, (row, col), first);
+            self.block::<S, G, WIDE>(simd, from, to, (row, col), first);
             col += WIDE * S::F32_LANES;
         }
         while col < columns {
-            self.block::<S, G, 1>(simd, from, to, base, (row, col), first);
+            self.block::<S, G, 1>(simd, from, to, (row, col), first);
             col += S::F32_LANES;
         }
     }
@@ -109,7 +82,6 @@ impl Convolution {
         simd: S,
         from: &[f32],
         to: &mut [f32],
-        base: Base<'_>,
         (row, col): (usize, usize),
         first: usize,
     ) {
@@ -118,16 +90,7 @@ impl Convolution {
         let corner = first * layout.plane + layout.row(row) + col;
         let place = |g: usize, b: usize| corner + g * layout.plane + b * S::F32_LANES;
         let mut sums = [[simd.splat_f32s(0.0); B]; G];
-        for (g, sums) in sums.iter_mut().enumerate() {
-            for (b, sum) in sums.iter_mut().enumerate() {
-                match base {
-                    Base::Zero => {}
-                    Base::Biases(biases) => *sum = simd.splat_f32s(biases[first + g]),
-                    Base::Planes => *sum = load::<S>(to, place(g, b)),
-                }
-            }
-        }
-        for plane in 0..self.n_from {
+        for plane in 0..self.layout.n_states {
             for a in 0..layout.kernel_height {
                 for c in 0..layout.kernel_width {
                     let at = plane * layout.plane + (row + a) * layout.stride + c + col;
@@ -137,7 +100,8 @@ impl Convolution {
                         *cells = load::<S>(from, at + b * S::F32_LANES);
                     }
                     for (g, sums) in sums.iter_mut().enumerate() {
-                        let weight = self.weights[(first + g) * self.n_from * n_taps + tap];
+                        let weight =
+                            self.weights[(first + g) * self.layout.n_states * n_taps + tap];
                         let weight = simd.splat_f32s(weight);
                         for (&cells, sum) in cells.iter().zip(sums) {
                             *sum = simd.mul_add_e_f32s(weight, cells, *sum);
@@ -164,8 +128,8 @@ impl Convolution {
         region: &Region,
         gradient: &mut [f64],
     ) {
-        let n_to = self.n_to();
-        for plane in 0..self.n_from {
+        let n_to = self.layout.n_states;
+        for plane in 0..self.layout.n_states {
             for kernel_row in 0..self.layout.kernel_height {
                 for to in (0..n_to).step_by(GROUP) {
                     let corner = [to, plane, kernel_row];
@@ -236,7 +200,7 @@ impl Convolution {
             }
         }
         for (g, sums) in sums.iter().enumerate() {
-            let entry = ((to + g) * self.n_from + from) * layout.n_taps();
+            let entry = ((to + g) * self.layout.n_states + from) * layout.n_taps();
             let entry = entry + kernel_row * layout.kernel_width + first;
             for (gradient, &sum) in gradient[entry..].iter_mut().zip(sums) {
                 *gradient += total::<S>(sum);

@@ -48,7 +48,7 @@ pub struct Recursion {
     predictors: Vec<f32>,
     /// Derivatives with respect to the belief: `dL/dp` or `dL/du`.
     by_belief: Vec<f32>,
-    /// `v` in the forward pass, and `dL/dv` in the backward pass.
+    /// Derivatives with respect to the weights' sums: `dL/dv`.
     by_weights: Vec<f32>,
 }
 
@@ -65,10 +65,9 @@ impl Recursion {
     pub fn new(tables: Tables, shape: Shape, n_frames: usize) -> Self {
         let dimensions = tables.dimensions;
         let layout = Layout::new(shape, dimensions.n_states, dimensions.kernel);
-        let operator = Operator::new(layout, dimensions.n_own(), &tables.kernel);
         Self {
-            by_weights: operator.weighed_planes(),
-            operator,
+            by_weights: layout.planes(),
+            operator: Operator::new(layout, &tables.kernel),
             tables,
             planes: vec![layout.planes(); n_frames + 1],
             factors: vec![vec![0.0; layout.plane]; n_frames + 1],
@@ -80,8 +79,7 @@ impl Recursion {
 
     /// Replaces the parameters with others of the same dimensions.
     pub fn set(&mut self, tables: &Tables) {
-        let n_own = tables.dimensions.n_own();
-        self.operator = Operator::new(self.operator.layout, n_own, &tables.kernel);
+        self.operator = Operator::new(self.operator.layout, &tables.kernel);
         self.tables.clone_from(tables);
     }
 
@@ -150,9 +148,8 @@ impl Recursion {
     fn predict<S: Simd>(&mut self, simd: S, frame: usize) {
         let (before, after) = self.planes.split_at_mut(frame + 1);
         let factors = &mut self.factors[frame + 1];
-        let weights = &mut self.by_weights;
         let (p, u) = (&before[frame], &mut after[0]);
-        self.operator.forward(simd, p, u, factors, weights);
+        self.operator.forward(simd, p, u, factors);
     }
 
     #[inline(always)]
@@ -206,11 +203,11 @@ impl Recursion {
         region: &Region,
         outcome: &mut Outcome,
     ) -> Region {
-        let (before, after) = self.planes.split_at_mut(frame);
-        let (p, u, factors) = (&before[frame - 1], &mut after[0], &self.factors[frame]);
+        let (p, u) = (&self.planes[frame - 1], &self.planes[frame]);
+        let factors = &self.factors[frame];
         let (g, h) = (&mut self.by_belief, &mut self.by_weights);
         let operator = &self.operator;
-        operator.backward_normalise(simd, p, u, factors, (g, h), region);
+        operator.backward_normalise(simd, u, factors, (g, h), region);
         operator.add_weight_gradient(simd, p, h, region, &mut outcome.gradient[0]);
         let reached = region.reached(&operator.layout);
         operator.backward_correlate(simd, h, g, reached.rows.clone());
@@ -262,7 +259,6 @@ impl WithSimd for Pass<'_> {
             .layout
             .unload(&recursion.planes[n_frames], self.end);
         recursion.backward(simd, n_frames, &mut outcome);
-        recursion.operator.end_gradient(&mut outcome.gradient[0]);
         if self.start.is_none() {
             recursion.add_initial_gradient(&mut outcome);
         }

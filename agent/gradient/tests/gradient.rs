@@ -74,36 +74,25 @@ fn loss(
 /// Computes eqs. 2 and 3 from their definitions.
 fn predicted(dimensions: Dimensions, kernel: &[f64], shape: Shape, belief: &[f64]) -> Vec<f64> {
     let (n_states, (rows, cols)) = (dimensions.n_states, dimensions.kernel);
-    let (n_cells, sees_own) = (shape.n_cells(), dimensions.sees_own_state);
-    let dim = (dimensions.n_own(), n_states, n_states, rows, cols);
+    let n_cells = shape.n_cells();
+    let dim = (n_states, n_states, rows, cols);
     let kernel = ArrayView::from_shape(dim, kernel).expect("a weight of each");
     let mut predicted = vec![0.0; n_states * n_cells];
     for cell in 0..n_cells {
         let Cell { row, col } = shape.cell(cell);
-        for (own, kernel) in kernel.outer_iter().enumerate() {
-            let mut weights = vec![0.0; n_states];
-            for ((to, from, down, right), weight) in kernel.indexed_iter() {
-                let near = Cell {
-                    row: (row + down).wrapping_sub(rows / 2),
-                    col: (col + right).wrapping_sub(cols / 2),
-                };
-                weights[to] += if !shape.contains(near) {
-                    0.0
-                } else if sees_own && near == (Cell { row, col }) {
-                    weight * f64::from(u8::from(from == own))
-                } else {
-                    weight * belief[from * n_cells + shape.index(near)]
-                };
-            }
-            let own = if sees_own {
-                belief[own * n_cells + cell]
-            } else {
-                1.0
+        let mut weights = vec![0.0; n_states];
+        for ((to, from, down, right), weight) in kernel.indexed_iter() {
+            let near = Cell {
+                row: (row + down).wrapping_sub(rows / 2),
+                col: (col + right).wrapping_sub(cols / 2),
             };
-            let sum: f64 = weights.iter().sum();
-            for (to, weight) in weights.iter().enumerate() {
-                predicted[to * n_cells + cell] += own * weight / sum;
+            if shape.contains(near) {
+                weights[to] += weight * belief[from * n_cells + shape.index(near)];
             }
+        }
+        let sum: f64 = weights.iter().sum();
+        for (to, weight) in weights.iter().enumerate() {
+            predicted[to * n_cells + cell] = weight / sum;
         }
     }
     predicted
@@ -141,48 +130,34 @@ fn check_gradients(dimensions: Dimensions, shape: Shape, from_belief: bool) {
     }
 }
 
-fn check_all_gradients(sees_own_state: bool) {
-    let height = if sees_own_state { 2 } else { 9 };
+#[test]
+fn gradients_agree_with_finite_differences() {
     for (n_states, n_observations, kernel, shape, from_belief) in [
         (3, 3, (3, 3), shape(6, 7), false),
         (3, 3, (3, 3), shape(6, 7), true),
         (2, 3, (1, 5), shape(4, 19), false),
-        (4, 2, (5, 3), shape(height, 70), true),
+        (4, 2, (5, 3), shape(9, 70), true),
         (7, 4, (3, 1), shape(3, 2), false),
     ] {
         let dimensions = Dimensions {
             n_states,
             n_observations,
             kernel,
-            sees_own_state,
         };
         check_gradients(dimensions, shape, from_belief);
     }
 }
 
 #[test]
-fn gradients_agree_with_finite_differences() {
-    check_all_gradients(false);
-}
-
-#[test]
-fn gradients_of_own_kernels_agree_with_finite_differences() {
-    check_all_gradients(true);
-}
-
-#[test]
 fn a_window_ends_with_the_filters_prediction() {
-    let burnout = Model::built_in("wildfire-burnout").expect("a built-in model");
-    let dimensions = |sees_own_state| Dimensions {
+    let dimensions = Dimensions {
         n_states: 3,
         n_observations: 3,
         kernel: (3, 3),
-        sees_own_state,
     };
     for tables in [
-        Parameters::first(dimensions(false), 2).tables(),
-        Parameters::first(dimensions(true), 2).tables(),
-        Tables::of_model(&burnout),
+        Parameters::first(dimensions, 2).tables(),
+        Tables::of_model(&Model::wildfire()),
     ] {
         let shape = shape(7, 18);
         let mut filter = BayesFilter::learned(&tables, tables.prior(shape));

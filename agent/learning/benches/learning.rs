@@ -17,12 +17,11 @@ fn shape() -> Shape {
     Shape::new(64, 64).expect("valid shape")
 }
 
-fn parameters(sees_own_state: bool) -> Parameters {
+fn parameters() -> Parameters {
     let dimensions = Dimensions {
         n_states: 3,
         n_observations: 3,
         kernel: (3, 3),
-        sees_own_state,
     };
     Parameters::first(dimensions, 0)
 }
@@ -58,29 +57,20 @@ fn frame(visited: &[usize]) -> Frame {
 }
 
 fn updates(c: &mut Criterion) {
-    for (n_threads, is_straight, sees_own_state) in [
-        (1, false, false),
-        (2, false, false),
-        (1, true, false),
-        (2, true, false),
-        (1, false, true),
-        (1, true, true),
-    ] {
+    for (n_threads, is_straight) in [(1, false), (2, false), (1, true), (2, true)] {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(n_threads)
             .build();
         let pool = pool.expect("threads");
         let mut replay = replay(is_straight);
         let config = AgentConfig::default().learning;
-        let mut optimiser = Optimiser::new(parameters(sees_own_state), shape(), config, 0);
+        let mut optimiser = Optimiser::new(parameters(), shape(), config, 0);
         let paths = if is_straight {
             "straight flights"
         } else {
             "random walks"
         };
-        let kernels = if sees_own_state { ", own kernels" } else { "" };
-        let name =
-            format!("update 16 x 16, {paths}, {n_threads} threads (target: 2 ms on 2){kernels}");
+        let name = format!("update 16 x 16, {paths}, {n_threads} threads (target: 2 ms on 2)");
         c.bench_function(&name, |b| {
             b.iter(|| {
                 pool.install(|| optimiser.update(&mut replay, Some(2)))
@@ -92,19 +82,14 @@ fn updates(c: &mut Criterion) {
 
 fn filter(c: &mut Criterion) {
     let frame = frame(&(0..40).collect::<Vec<_>>());
-    for (sees_own_state, kernels) in [(false, ""), (true, ", own kernels")] {
-        let tables: Tables = parameters(sees_own_state).tables();
-        let mut filter = BayesFilter::learned(&tables, tables.prior(shape()));
-        c.bench_function(
-            &format!("learned filter: correct + predict{kernels}"),
-            |b| {
-                b.iter(|| {
-                    filter.correct(&frame).expect("possible");
-                    filter.predict();
-                });
-            },
-        );
-    }
+    let tables: Tables = parameters().tables();
+    let mut filter = BayesFilter::learned(&tables, tables.prior(shape()));
+    c.bench_function("learned filter: correct + predict", |b| {
+        b.iter(|| {
+            filter.correct(&frame).expect("possible");
+            filter.predict();
+        });
+    });
 }
 
 criterion_group!(benches, updates, filter);

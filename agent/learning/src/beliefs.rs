@@ -14,10 +14,8 @@ mod world_form;
 
 pub use self::autoencoder::AUTOENCODER;
 pub use self::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy, numbered_states};
-pub use self::known::{
-    KNOWN, KNOWN_CAVITIES, KNOWN_SECOND_ORDER, KNOWN_SPATIAL, KNOWN_SPATIAL_CAVITIES,
-};
-pub use self::learned::{LEARNED, LEARNED_CAVITIES, LEARNED_SPATIAL, LEARNED_SPATIAL_CAVITIES};
+pub use self::known::{KNOWN, KNOWN_CAVITIES, KNOWN_SPATIAL, KNOWN_SPATIAL_CAVITIES};
+pub use self::learned::{LEARNED, LEARNED_SPATIAL};
 pub use self::neural::{NEURAL, NEURAL_SENSOR};
 pub use self::truth::{NONE, TRUTH};
 pub use self::world_form::WorldForm;
@@ -28,13 +26,10 @@ pub const BELIEFS: &[&BeliefKind] = &[
     &NONE,
     &KNOWN,
     &KNOWN_SPATIAL,
-    &KNOWN_SECOND_ORDER,
     &KNOWN_CAVITIES,
     &KNOWN_SPATIAL_CAVITIES,
     &LEARNED,
     &LEARNED_SPATIAL,
-    &LEARNED_CAVITIES,
-    &LEARNED_SPATIAL_CAVITIES,
     &NEURAL,
     &NEURAL_SENSOR,
     &AUTOENCODER,

@@ -3,7 +3,7 @@
 mod sections;
 
 pub use sections::{
-    AutoencoderConfig, DecisionsConfig, KernelKind, LearningConfig, NetworkDqnConfig, NeuralConfig,
+    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, NeuralConfig,
     ObjectiveConfig, StepSize,
 };
 
@@ -39,7 +39,6 @@ pub struct AgentConfig {
     pub seed: u64,
     /// The name of the learner that `train` uses.
     pub learner: String,
-    pub kernels: KernelKind,
     pub full_frames: bool,
     pub objective: ObjectiveConfig,
     pub learning: LearningConfig,
@@ -208,10 +207,7 @@ mod tests {
             let name = settings.split(" = ").next().unwrap_or_default();
             assert_eq!(error.to_string(), format!("{name}: expected {expected}"));
         }
-        for (settings, words) in [
-            ("objective.belief = 'prior'", "`predictor` or `estimate`"),
-            ("kernels = 'cell'", "`neighbours` or `own`"),
-        ] {
+        for (settings, words) in [("objective.belief = 'prior'", "`predictor` or `estimate`")] {
             let error = AgentConfig::from_toml(settings).expect_err(settings);
             assert!(error.to_string().contains(words), "{error}");
         }

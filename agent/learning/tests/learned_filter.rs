@@ -44,7 +44,7 @@ fn off(a: &Belief, b: &Belief) -> f32 {
 
 #[test]
 fn with_the_true_parameters_it_is_the_known_model_filter() {
-    for name in ["wildfire", "road-ice", "wildfire-burnout"] {
+    for name in ["wildfire", "road-ice"] {
         let model = Model::built_in(name).expect("a built-in model");
         for shape in [shape(1, 1), shape(20, 33)] {
             let prior = Belief::uniform(model.n_states(), shape);
@@ -62,19 +62,6 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
             assert!(off < 1e-5, "{name} on {shape}: {off}");
         }
     }
-}
-
-#[test]
-fn initial_kernels_are_similar_for_every_own_state() {
-    let prior = belief(3, shape(12, 40), 0);
-    let [one, own] = [false, true].map(|sees_own_state| {
-        let tables = Parameters::first(dimensions(sees_own_state), 0).tables();
-        let mut filter = BayesFilter::learned(&tables, prior.clone());
-        filter.predict();
-        filter.belief().clone()
-    });
-    // The weights differ by 10 % noise.
-    assert!(off(&one, &own) < 0.05);
 }
 
 fn config() -> LearningConfig {
@@ -101,22 +88,21 @@ fn replay(n_frames: u64) -> BlockReplay {
 }
 
 /// Returns the dimensions of a filter for the wildfire model.
-pub fn dimensions(sees_own_state: bool) -> Dimensions {
+fn dimensions() -> Dimensions {
     Dimensions {
         n_states: 3,
         n_observations: 3,
         kernel: (3, 3),
-        sees_own_state,
     }
 }
 
-fn optimiser(sees_own_state: bool, seed: u64) -> Optimiser {
-    let parameters = Parameters::first(dimensions(sees_own_state), seed);
+fn optimiser(seed: u64) -> Optimiser {
+    let parameters = Parameters::first(dimensions(), seed);
     Optimiser::new(parameters, shape(10, 12), config(), seed)
 }
 
-fn updates(n: usize, sees_own_state: bool, seed: u64) -> (Vec<Update>, Parameters) {
-    let mut optimiser = optimiser(sees_own_state, seed);
+fn updates(n: usize, seed: u64) -> (Vec<Update>, Parameters) {
+    let mut optimiser = optimiser(seed);
     let mut replay = replay(40);
     let mut update = || optimiser.update(&mut replay, Some(2)).expect("finite");
     let updates = (0..n).map(|_| update().expect("full")).collect();
@@ -125,38 +111,34 @@ fn updates(n: usize, sees_own_state: bool, seed: u64) -> (Vec<Update>, Parameter
 
 #[test]
 fn training_repeats_bit_for_bit_on_any_number_of_threads() {
-    for sees_own_state in [false, true] {
-        let on = |n_threads: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads);
-            let pool = pool.build().expect("threads");
-            pool.install(|| updates(10, sees_own_state, 1))
-        };
-        let one = on(1);
-        assert_eq!(one, on(2));
-        assert_ne!(one.0, updates(10, sees_own_state, 2).0, "another seed");
-    }
+    let on = |n_threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads);
+        let pool = pool.build().expect("threads");
+        pool.install(|| updates(10, 1))
+    };
+    let one = on(1);
+    assert_eq!(one, on(2));
+    assert_ne!(one.0, updates(10, 2).0, "another seed");
 }
 
 #[test]
 fn training_lowers_the_loss() {
-    for sees_own_state in [false, true] {
-        let (updates, _) = updates(200, sees_own_state, 3);
-        let mean = |part: &[Update]| part.iter().map(|u| u.loss).sum::<f64>() / part.len() as f64;
-        let (before, after) = (mean(&updates[..20]), mean(&updates[180..]));
-        assert!(after < before - 0.1, "{before} {after}");
-    }
+    let (updates, _) = updates(200, 3);
+    let mean = |part: &[Update]| part.iter().map(|u| u.loss).sum::<f64>() / part.len() as f64;
+    let (before, after) = (mean(&updates[..20]), mean(&updates[180..]));
+    assert!(after < before - 0.1, "{before} {after}");
 }
 
 #[test]
 fn training_waits_for_a_block_for_each_stream() {
     let mut replay = replay(16); // 4 blocks
-    let update = optimiser(false, 0).update(&mut replay, None);
+    let update = optimiser(0).update(&mut replay, None);
     assert_eq!(update.expect("finite"), None);
 }
 
 #[test]
 fn a_non_finite_parameter_stops_training_with_an_error() {
-    let mut parameters = Parameters::first(dimensions(false), 0);
+    let mut parameters = Parameters::first(dimensions(), 0);
     parameters.tensors[1][4] = f32::NAN;
     let before = format!("{parameters:?}");
     let mut optimiser = Optimiser::new(parameters, shape(10, 12), config(), 0);

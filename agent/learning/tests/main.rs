@@ -1,5 +1,4 @@
 //! All integration tests in one program, because linking candle takes a long time.
 
 mod learned_filter;
-mod own_kernels;
 mod rollout;

@@ -10,7 +10,7 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_learning::beliefs::{self, BeliefKind, LEARNED};
 use emberwatch_learning::checkpoint::Contents;
-use emberwatch_learning::config::{AgentConfig, KernelKind};
+use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners::decisions::{SavedDecisions, belief_of};
 use emberwatch_learning::learners::filter::FILTER;
@@ -54,9 +54,6 @@ pub struct TrainCommand {
     /// What to learn [default: filter; with --preset paper: autoencoder]
     #[arg(long, value_parser = one_of_names(LEARNERS.iter().map(|kind| (kind.name, kind.about))))]
     learner: Option<String>,
-    /// What a filter's kernels depend on [default: neighbours]
-    #[arg(long, value_parser = one_of(&KernelKind::ALL))]
-    kernels: Option<KernelKind>,
     /// World steps to act, summed over all worlds; 0: until stopped [default: 0; with --learner neural or decisions:
     /// the remaining steps of the settings]
     #[arg(long)]
@@ -132,9 +129,6 @@ impl TrainCommand {
         if let Some(learner) = &self.learner {
             config.learner.clone_from(learner);
         }
-        if let Some(kernels) = self.kernels {
-            config.kernels = kernels;
-        }
         if let Some(estimator) = self.estimator {
             config.decisions.estimator = estimator.name.into();
         }
@@ -197,16 +191,6 @@ impl TrainCommand {
         } else {
             belief_of(&config.decisions.estimator)?
         };
-        let by = belief.learned_by.as_ref();
-        let begins_filter = decides
-            && self.checkpoint.is_none()
-            && !self.resume
-            && by.is_some_and(|by| by.learner == FILTER.name);
-        ensure!(
-            self.kernels.is_none() || *kind == FILTER || begins_filter,
-            "--kernels applies only where a filter is trained: with --learner filter, or with --learner decisions \
-             on a learned filter, without --checkpoint and --resume"
-        );
         let learned = learners::read(self.checkpoint.as_deref(), device)?;
         if let Some(path) = &self.checkpoint {
             ensure!(
@@ -239,12 +223,6 @@ impl TrainCommand {
         if let Some(contents) = &contents {
             self.check_no_checkpoint()?;
             (kind.adopt)(contents, &mut training.config);
-            let (expected, got) = (training.config.kernels, self.kernels);
-            ensure!(
-                got.is_none_or(|got| got == expected),
-                "--kernels: expected {expected} as in the checkpoint, got {}",
-                got.unwrap_or(expected)
-            );
             let (expected, got) = (training.config.full_frames, self.full_frames);
             ensure!(
                 got.is_none_or(|got| got == expected),

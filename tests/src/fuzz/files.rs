@@ -38,11 +38,12 @@ pub fn model(bytes: &[u8]) -> bool {
     let grids = [(1, 1), (2, 5), (3, 17)].map(|(height, width)| Shape::new(height, width));
     for shape in grids.into_iter().flatten() {
         let fits = model.check_on(shape).is_ok();
-        let transition = Transition::new(&model, shape);
+        let prior = Belief::uniform(model.n_states(), shape);
+        let filter = BayesFilter::known(&model, prior, true);
         let dynamics = Dynamics::new(&model, shape);
-        assert_eq!((transition.is_ok(), dynamics.is_ok()), (fits, fits));
-        if let (Ok(transition), Ok(dynamics)) = (transition, dynamics) {
-            beliefs_stay_beliefs(&model, shape, transition);
+        assert_eq!((filter.is_ok(), dynamics.is_ok()), (fits, fits));
+        if let (Ok(_), Ok(dynamics)) = (filter, dynamics) {
+            beliefs_stay_beliefs(&model, shape);
             states_stay_states(&model, dynamics);
             robots_stay_free(&model.airspace(shape).expect("it fits"));
         }
@@ -51,16 +52,18 @@ pub fn model(bytes: &[u8]) -> bool {
 }
 
 /// Checks that predictions from one-hot beliefs and from the uniform belief are valid beliefs.
-fn beliefs_stay_beliefs(model: &Model, shape: Shape, mut transition: Transition) {
+fn beliefs_stay_beliefs(model: &Model, shape: Shape) {
     let dim = (model.n_states(), shape.height(), shape.width());
-    let mut next = Array3::zeros(dim);
     for certain in 0..=dim.0 {
         let belief = Array3::from_shape_fn(dim, |(state, _, _)| match certain {
             all if all == dim.0 => 1.0 / dim.0 as f32,
             one if one == state => 1.0,
             _ => 0.0,
         });
-        transition.apply(&belief, &mut next);
+        let prior = Belief::from_probabilities(belief).expect("a belief");
+        let mut filter = BayesFilter::known(model, prior, true).expect("fits");
+        (0..2).for_each(|_| filter.predict());
+        let next = filter.belief().view();
         let sums = next.sum_axis(Axis(0));
         assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3), "{sums}");
         assert!(next.iter().all(|p| (0.0..=1.001).contains(p)), "{next}");
@@ -117,7 +120,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         // Checkpoints of the decisions learner also contain a filter, but a filter learner can resume only from its own
         // checkpoints.
         if learners::filter::FILTER.checkpoint == kind {
-            learn(&contents, filter.tables.dimensions.sees_own_state);
+            learn(&contents);
         }
     }
     if learned.get::<LearnedDecisions>().is_some() {
@@ -132,8 +135,8 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
 }
 
 /// Resumes from a filter's checkpoint, if the learner accepts it, and may run an update.
-fn learn(contents: &Contents, sees_own_state: bool) {
-    let learner = FilterLearner::resume(contents, dimensions(sees_own_state), worlds(), &config());
+fn learn(contents: &Contents) {
+    let learner = FilterLearner::resume(contents, dimensions(), worlds(), &config());
     if let Ok(mut learner) = learner {
         let again = learner.contents().expect("no device");
         let saved: SavedFilter = again.state().expect("its state");
@@ -143,12 +146,11 @@ fn learn(contents: &Contents, sees_own_state: bool) {
     }
 }
 
-fn dimensions(sees_own_state: bool) -> Dimensions {
+fn dimensions() -> Dimensions {
     Dimensions {
         n_states: 2,
         n_observations: 2,
         kernel: (1, 3),
-        sees_own_state,
     }
 }
 

@@ -54,7 +54,7 @@ impl BayesFilter {
     pub fn learned(tables: &Tables, prior: Belief) -> Self {
         let prediction = Prediction::learned(tables, &prior);
         let likelihood = tables.likelihood_array();
-        let checksum = checksum(tables.kernels()[0].iter().copied(), &likelihood);
+        let checksum = checksum(tables.kernel_array().into_iter(), &likelihood);
         Self::new(prediction, likelihood, prior, checksum)
     }
 

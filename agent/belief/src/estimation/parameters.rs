@@ -39,10 +39,6 @@ pub struct Dimensions {
     pub n_observations: usize,
     /// Number of rows and number of columns of the kernel, both odd.
     pub kernel: (usize, usize),
-    /// Whether there is a separate kernel for each current state of the cell, which is called the cell's *own state*.
-    /// In a checkpoint, the shape of a tensor encodes this setting.
-    #[serde(skip)]
-    pub sees_own_state: bool,
 }
 
 /// Three tensors in the order of [`Parameters::NAMES`], which contain unconstrained values, the gradients of these
@@ -50,7 +46,7 @@ pub struct Dimensions {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
-    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, `[S, O]`, and `[S]`, row-major.
+    /// `[S, S, KH, KW]`, `[S, O]`, and `[S]`, row-major.
     #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
 }
@@ -59,8 +55,7 @@ pub struct Parameters {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables {
     pub dimensions: Dimensions,
-    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`. With own-state kernels, centre weights apply only if
-    /// `from` equals `own`.
+    /// `w[to, from, row, col]`.
     pub kernel: Vec<f32>,
     /// `P(y | x)`, shape `[S, O]`.
     pub likelihood: Vec<f32>,
@@ -110,20 +105,8 @@ impl Dimensions {
     /// Returns the shapes of the tensors, in the order of [`Parameters::NAMES`].
     pub fn shapes(&self) -> [Vec<usize>; 3] {
         let (states, (height, width)) = (self.n_states, self.kernel);
-        let mut kernel = vec![states, states, height, width];
-        if self.sees_own_state {
-            kernel.insert(0, states);
-        }
+        let kernel = vec![states, states, height, width];
         [kernel, vec![states, self.n_observations], vec![states]]
-    }
-
-    /// Returns the number of kernels: S with own-state kernels, otherwise 1.
-    pub fn n_own(&self) -> usize {
-        if self.sees_own_state {
-            self.n_states
-        } else {
-            1
-        }
     }
 
     /// Returns the number of entries of each tensor.
@@ -139,7 +122,7 @@ impl Parameters {
     /// Returns the initial parameters for learning.
     ///
     /// With these parameters, states persist and spread to neighbours. Each state is mostly observed as the value with
-    /// the same index, if that value exists. All own-state kernels start equal, except for noise.
+    /// the same index, if that value exists.
     pub fn first(dimensions: Dimensions, seed: u64) -> Self {
         let [n_kernel, n_likelihood, n_initial] = dimensions.lengths();
         // Uniform in -1..1.
@@ -252,7 +235,6 @@ impl Tables {
                 n_states: model.n_states(),
                 n_observations: model.n_observations(),
                 kernel: (height, width),
-                sees_own_state: false,
             },
             kernel: ratio.kernel().iter().map(cast).collect(),
             likelihood: model.likelihood().iter().map(cast).collect(),
@@ -260,16 +242,16 @@ impl Tables {
         }
     }
 
-    /// Returns the kernels, each of shape `[S, S, KH, KW]`: one for all own states, or one per own state.
-    pub fn kernels(&self) -> Vec<Array4<f64>> {
+    /// Returns the kernel as an array of shape `[S, S, KH, KW]`.
+    pub fn kernel_array(&self) -> Array4<f64> {
         let (n, (height, width)) = (self.dimensions.n_states, self.dimensions.kernel);
-        let kernel = |weights: &[f32]| {
-            let weights = weights.iter().map(|&weight| f64::from(weight)).collect();
-            let kernel = Array4::from_shape_vec((n, n, height, width), weights);
-            kernel.expect("invariant: S x S kernels")
-        };
-        let kernels = self.kernel.chunks_exact(n * n * height * width);
-        kernels.map(kernel).collect()
+        let weights = self
+            .kernel
+            .iter()
+            .map(|&weight| f64::from(weight))
+            .collect();
+        let kernel = Array4::from_shape_vec((n, n, height, width), weights);
+        kernel.expect("invariant: S x S kernels")
     }
 
     /// Returns `P(y | x)` as an array of shape `[S, O]`.
@@ -285,7 +267,7 @@ fn first_weight(dimensions: Dimensions, index: usize) -> f64 {
     let n_taps = height * width;
     let (pair, tap) = (index / n_taps, index % n_taps);
     let (to, from) = (pair / dimensions.n_states, pair % dimensions.n_states);
-    let is_own = to % dimensions.n_states == from;
+    let is_own = to == from;
     let is_centre = tap == n_taps / 2;
     let near = if is_centre {
         OWN_WEIGHT
@@ -323,7 +305,6 @@ mod tests {
             n_states: 3,
             n_observations: 4,
             kernel: (3, 1),
-            sees_own_state: false,
         }
     }
 

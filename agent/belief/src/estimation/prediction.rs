@@ -85,8 +85,8 @@ impl Prediction {
             n_states,
             "belief: expected the parameters' number of states"
         );
-        let (kernel, bias) = (&tables.kernels()[0], vec![0.0; n_states]);
-        let transition = Transition::new(kernel, &bias, None, belief.shape());
+        let (kernel, bias) = (tables.kernel_array(), vec![0.0; n_states]);
+        let transition = Transition::new(&kernel, &bias, None, belief.shape());
         Self(Kind::ratio(transition, belief))
     }
 

@@ -1,11 +1,10 @@
 //! Bayes filters with the true model (paper section III.A, masked as in III.C).
 //!
-//! The kinds differ in their prediction (mean field, second order or cavities), and in whether corrections reach the
-//! neighbours of visited cells.
+//! The kinds differ in their prediction of models of hazards (with or without cavities), and in whether corrections
+//! reach the neighbours of visited cells.
 
 use super::kind::{BeliefKind, Conditions, Input};
 use anyhow::Result;
-use emberwatch_belief::estimation::prediction::PredictionKind;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, SpatialFilter};
 use emberwatch_model::Model;
 
@@ -16,61 +15,53 @@ pub const KNOWN: BeliefKind = BeliefKind {
     knows_model: true,
     learned_by: None,
     chart: ("known model", [0x00, 0x72, 0xb2]),
-    handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::MeanField)),
-    build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::MeanField)?)),
-};
-
-pub const KNOWN_SECOND_ORDER: BeliefKind = BeliefKind {
-    name: "known+second-order",
-    about: "known, with a second-order mean of the ratio in eq. 3",
-    handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::SecondOrder)),
-    build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::SecondOrder)?)),
-    ..KNOWN
+    handover: Some(|model| BayesFilter::handover_of_known(model, false)),
+    build: |conditions| Ok(Box::new(filter(conditions, false)?)),
 };
 
 pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
     name: "known+cavities",
-    about: "known, predicting a cell without its own influence on its neighbours",
-    handover: Some(|model| BayesFilter::handover_of_known(model, PredictionKind::Cavities)),
-    build: |conditions| Ok(Box::new(filter(conditions, PredictionKind::Cavities)?)),
+    about: "known, predicting a cell without its own influence on its neighbours; with the paper's rule, the same as known",
+    handover: Some(|model| BayesFilter::handover_of_known(model, true)),
+    build: |conditions| Ok(Box::new(filter(conditions, true)?)),
     ..KNOWN
 };
 
 pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
     name: "known+spatial",
     about: "known, where observations also correct neighbouring cells",
-    handover: Some(|model| spatial_handover(model, PredictionKind::MeanField)),
-    build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::MeanField)?)),
+    handover: Some(|model| spatial_handover(model, false)),
+    build: |conditions| Ok(Box::new(spatial(conditions, false)?)),
     ..KNOWN
 };
 
 pub const KNOWN_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "known+spatial+cavities",
     about: "known+spatial, predicting like known+cavities",
-    handover: Some(|model| spatial_handover(model, PredictionKind::Cavities)),
-    build: |conditions| Ok(Box::new(spatial(conditions, PredictionKind::Cavities)?)),
+    handover: Some(|model| spatial_handover(model, true)),
+    build: |conditions| Ok(Box::new(spatial(conditions, true)?)),
     ..KNOWN
 };
 
 /// Builds the filter with the true model.
-fn filter(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<BayesFilter> {
+fn filter(conditions: &Conditions<'_>, cavities: bool) -> Result<BayesFilter> {
     let model = conditions.model()?;
-    Ok(BayesFilter::known(model, conditions.prior()?)?.predicting_known(model, kind))
+    Ok(BayesFilter::known(model, conditions.prior()?, cavities)?)
 }
 
 /// Builds a filter with the true model. Its corrections reach the neighbours of visited cells.
-fn spatial(conditions: &Conditions<'_>, kind: PredictionKind) -> Result<SpatialFilter> {
+fn spatial(conditions: &Conditions<'_>, cavities: bool) -> Result<SpatialFilter> {
     let (filter, state) = (
-        filter(conditions, kind)?,
+        filter(conditions, cavities)?,
         conditions.model()?.target_state(),
     );
     Ok(SpatialFilter::new(filter, state, Correlations::default()))
 }
 
 /// Returns the name of the format in which an agent hands over a spatial filter, see `Handover::kind`.
-fn spatial_handover(model: &Model, kind: PredictionKind) -> String {
+fn spatial_handover(model: &Model, cavities: bool) -> String {
     SpatialFilter::handover_of(
-        &BayesFilter::handover_of_known(model, kind),
+        &BayesFilter::handover_of_known(model, cavities),
         model.target_state(),
     )
 }
@@ -93,7 +84,6 @@ mod tests {
         };
         for kind in [
             &KNOWN,
-            &KNOWN_SECOND_ORDER,
             &KNOWN_CAVITIES,
             &KNOWN_SPATIAL,
             &KNOWN_SPATIAL_CAVITIES,

@@ -1,14 +1,12 @@
 //! Bayes filters with learned parameters.
 //!
-//! The kinds differ in their prediction, and in whether corrections reach the neighbours of visited cells. Kernels can
-//! depend on a cell's own state, which a checkpoint records only in the shape of the kernel tensor.
+//! The kinds differ in whether corrections reach the neighbours of visited cells.
 
 use super::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy};
 use super::world_form::WorldForm;
 use crate::checkpoint::{Part, check, wrong};
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
-use emberwatch_belief::estimation::prediction::PredictionKind;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_model::Shape;
 use emberwatch_network::NamedTensor;
@@ -26,35 +24,13 @@ pub const LEARNED: BeliefKind = BeliefKind {
     }),
     chart: ("learned", [0x00, 0x9e, 0x73]),
     handover: None,
-    build: |conditions| {
-        Ok(model(conditions)?.estimator(false, PredictionKind::MeanField, conditions.shape))
-    },
+    build: |conditions| Ok(model(conditions)?.estimator(false, conditions.shape)),
 };
 
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
     about: "learned, where observations also correct neighbouring cells",
-    build: |conditions| {
-        Ok(model(conditions)?.estimator(true, PredictionKind::MeanField, conditions.shape))
-    },
-    ..LEARNED
-};
-
-pub const LEARNED_CAVITIES: BeliefKind = BeliefKind {
-    name: "learned+cavities",
-    about: "learned, predicting like known+cavities",
-    build: |conditions| {
-        Ok(model(conditions)?.estimator(false, PredictionKind::Cavities, conditions.shape))
-    },
-    ..LEARNED
-};
-
-pub const LEARNED_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
-    name: "learned+spatial+cavities",
-    about: "learned+spatial, predicting like known+cavities",
-    build: |conditions| {
-        Ok(model(conditions)?.estimator(true, PredictionKind::Cavities, conditions.shape))
-    },
+    build: |conditions| Ok(model(conditions)?.estimator(true, conditions.shape)),
     ..LEARNED
 };
 
@@ -89,14 +65,8 @@ impl LearnedModel {
     /// Builds an estimator before its first frame.
     ///
     /// If `is_spatial`, corrections reach the neighbours of visited cells.
-    pub fn estimator(
-        &self,
-        is_spatial: bool,
-        kind: PredictionKind,
-        shape: Shape,
-    ) -> Box<dyn Estimator> {
+    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Box<dyn Estimator> {
         let filter = BayesFilter::learned(&self.tables, self.tables.prior(shape));
-        let filter = filter.predicting_learned(&self.tables, kind);
         let neighbours = || (self.target, self.correlations.clone());
         correcting(filter, is_spatial.then(neighbours))
     }
@@ -141,7 +111,7 @@ impl SavedModel {
 
     /// Loads the model, with its tensors from a part of a checkpoint.
     pub fn read(&self, part: &Part<'_>) -> Result<LearnedModel> {
-        let dimensions = dimensions_of(self.dimensions, part)?;
+        let dimensions = checked(self.dimensions, part)?;
         let parameters = read_parameters(dimensions, part, "")?;
         check_target(self.target, dimensions.n_states)?;
         let correlations = self.correlations.clone();
@@ -169,27 +139,18 @@ pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] 
     })
 }
 
-/// Whether a stored filter has own-state kernels, whose tensor has five axes.
-pub fn sees_own_state(part: &Part<'_>) -> bool {
-    let shape = part.shape(Parameters::NAMES[0]);
-    shape.is_some_and(|shape| shape.len() == 5)
-}
-
-/// Completes the dimensions of a stored filter with whether there are own-state kernels, which only its tensors reveal.
+/// Checks the dimensions of a stored filter.
 ///
 /// # Errors
-/// If a dimension is out of range, or the filter has kernels for zones.
-pub fn dimensions_of(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensions> {
+/// If a dimension is out of range, or the filter has kernels that depend on the cell's own state or zone.
+pub fn checked(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensions> {
+    let n_axes = part.shape(Parameters::NAMES[0]).map_or(4, <[usize]>::len);
     check(
-        part.shape("zones").is_none(),
-        "zones",
-        "the same kernels in every cell",
-        "kernels for each zone of land: train the filter again",
+        n_axes == 4 && part.shape("zones").is_none(),
+        "kernel",
+        "the same weights in every cell",
+        "kernels by own state or zone, which earlier releases learned: train the filter again",
     )?;
-    let dimensions = Dimensions {
-        sees_own_state: sees_own_state(part),
-        ..dimensions
-    };
     let checked = dimensions.check();
     checked.map_err(|error| wrong("dimensions", "valid dimensions of a filter", error))
 }

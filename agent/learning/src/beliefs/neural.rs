@@ -17,7 +17,6 @@ use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::{check as check_evidence, correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
-use emberwatch_belief::estimation::prediction::PredictionKind;
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, MAX_VALUES, Shape};
 use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief, Sightings};
@@ -122,7 +121,7 @@ pub fn estimator(
     filter: Option<&LearnedModel>,
     shape: Shape,
 ) -> Result<NeuralEstimator> {
-    let filter = filter.map(|it| it.estimator(true, PredictionKind::MeanField, shape));
+    let filter = filter.map(|it| it.estimator(true, shape));
     Ok(NeuralEstimator::new(network, filter, shape)?)
 }
 

@@ -5,7 +5,6 @@ use emberwatch_belief::estimation::belief::EntropyKind;
 use emberwatch_belief::planning::BasisKind;
 use emberwatch_network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
-use std::fmt;
 
 /// Maximum decay rate of Adam's moving averages. At 1, the averages would never change.
 const MAX_BETA: f64 = 0.999_999;
@@ -39,47 +38,6 @@ pub struct LearningConfig {
     pub anchor: f64,
     pub explore_steps: u64,
     pub explore_share: f64,
-}
-
-/// The inputs of a learned filter's kernels.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum KernelKind {
-    /// The states of the neighbours (paper eq. 4).
-    Neighbours,
-    /// The states of the neighbours and of the cell itself (its *own state*), with one kernel for each own state.
-    Own,
-}
-
-impl KernelKind {
-    /// Each kind with its name and a description.
-    pub const ALL: [(Self, &str, &str); 2] = [
-        (
-            Self::Neighbours,
-            "neighbours",
-            "The states of the neighbours, as in the paper",
-        ),
-        (
-            Self::Own,
-            "own",
-            "Also the cell's own state, with one kernel for each own state",
-        ),
-    ];
-
-    pub fn of(sees_own_state: bool) -> Self {
-        if sees_own_state {
-            Self::Own
-        } else {
-            Self::Neighbours
-        }
-    }
-}
-
-impl fmt::Display for KernelKind {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let found = Self::ALL.iter().find(|(kind, ..)| kind == self);
-        formatter.write_str(found.expect("invariant: the table has every kind").1)
-    }
 }
 
 /// Settings of `train --learner neural`.

@@ -62,7 +62,6 @@ mod tests {
             n_states: 2,
             n_observations: 2,
             kernel: (1, 1),
-            sees_own_state: false,
         };
         let mut parameters = Parameters::zeros(dimensions);
         let mut gradient = Parameters::zeros(dimensions);

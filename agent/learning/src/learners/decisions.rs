@@ -10,9 +10,8 @@ pub use self::saved::{SHAPE, SavedDecisions};
 
 use self::run::{Run, features};
 use self::saved::{Held, SavedBelief, SavedRun};
-use crate::beliefs::learned::sees_own_state;
 use crate::checkpoint::{Contents, check};
-use crate::config::{AgentConfig, KernelKind};
+use crate::config::AgentConfig;
 use crate::learners::base::{
     Beginning, Learner, LearnerKind, Learning, Saving, Worlds, lacks_steps,
 };
@@ -38,10 +37,7 @@ pub const DECISIONS: LearnerKind = LearnerKind {
     steps: |config| config.decisions.steps,
     episode_steps: |config| Some(config.decisions.episode_steps),
     done: |contents| Ok(contents.state::<SavedDecisions>()?.world_steps),
-    adopt: |contents, config| {
-        let sees_own_state = sees_own_state(&contents.part(saved::BELIEF));
-        config.kernels = KernelKind::of(sees_own_state);
-    },
+    adopt: |_, _| (),
     read: saved::read,
     begin,
 };

@@ -7,10 +7,10 @@ mod saved;
 pub use self::saved::SavedFilter;
 
 use self::saved::SavedRobot;
-use crate::beliefs::learned::{LearnedModel, dimensions_of, sees_own_state};
+use crate::beliefs::learned::{LearnedModel, checked};
 use crate::beliefs::{LEARNED, numbered_states};
 use crate::checkpoint::Contents;
-use crate::config::{AgentConfig, KernelKind};
+use crate::config::AgentConfig;
 use crate::learners::base::{Beginning, Learner, LearnerKind, Learning, Saving, Worlds};
 use crate::learners::filter::fit::FilterFit;
 use crate::learners::update::ModelUpdate;
@@ -50,14 +50,13 @@ pub const FILTER: LearnerKind = LearnerKind {
     episode_steps: |_| None,
     done: |contents| Ok(contents.state::<SavedFilter>()?.fit.world_steps),
     adopt: |contents, config| {
-        config.kernels = KernelKind::of(sees_own_state(&contents.part("")));
         if let Ok(settings) = contents.settings() {
             config.full_frames = settings.full_frames;
         }
     },
     read: |contents, _, learned| {
         let mut fit = contents.state::<SavedFilter>()?.fit;
-        let dimensions = dimensions_of(fit.optimiser.dimensions(), &contents.part(""))?;
+        let dimensions = checked(fit.optimiser.dimensions(), &contents.part(""))?;
         fit.load(contents, dimensions)?;
         Ok(learned.put(fit.learned()))
     },
@@ -85,7 +84,6 @@ fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
         },
         n_observations: worlds.n_observations,
         kernel: (learning.kernel[0], learning.kernel[1]),
-        sees_own_state: config.kernels == KernelKind::Own,
     };
     Ok(dimensions.check()?)
 }

@@ -41,12 +41,11 @@ pub(crate) fn config(belief: BasisKind) -> AgentConfig {
     config
 }
 
-fn dimensions(sees_own_state: bool) -> Dimensions {
+fn dimensions() -> Dimensions {
     Dimensions {
         n_states: 3,
         n_observations: 3,
         kernel: (3, 3),
-        sees_own_state,
     }
 }
 
@@ -95,7 +94,7 @@ fn check_basis(mut learner: impl Learner, basis: BasisKind) {
 fn learners_plan_on_the_configured_belief() {
     for basis in [BasisKind::Predictor, BasisKind::Estimate] {
         let config = &config(basis);
-        let learner = FilterLearner::new(dimensions(false), worlds(), config);
+        let learner = FilterLearner::new(dimensions(), worlds(), config);
         check_basis(learner, basis);
         let progress = Progress::first(&worlds(), config, &Device::Cpu);
         let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
@@ -124,9 +123,9 @@ fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
 }
 
 /// A filter with its initial parameters.
-pub(crate) fn learned_filter(sees_own_state: bool) -> LearnedModel {
+pub(crate) fn learned_filter() -> LearnedModel {
     let config = config(BasisKind::Estimate);
-    FilterFit::new(dimensions(sees_own_state), worlds().shape(), &config).learned()
+    FilterFit::new(dimensions(), worlds().shape(), &config).learned()
 }
 
 #[test]
@@ -143,16 +142,16 @@ fn decisions_resume_bit_for_bit() {
         });
         learned
     };
-    let filter = |sees_own_state| {
+    let filter = || {
         let mut learned = Learned::default();
-        learned.put(learned_filter(sees_own_state));
+        learned.put(learned_filter());
         learned
     };
     for (kind, learned) in [
-        (&LEARNED, filter(true)),
-        (&LEARNED_SPATIAL, filter(false)),
+        (&LEARNED, filter()),
+        (&LEARNED_SPATIAL, filter()),
         (&NEURAL, neural(None)),
-        (&NEURAL, neural(Some(learned_filter(false)))),
+        (&NEURAL, neural(Some(learned_filter()))),
     ] {
         let base = Base::new(kind, None, learned, worlds().shape()).expect("learned");
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
@@ -297,7 +296,7 @@ fn neural(
 
 #[test]
 fn a_learned_filter_resumes_bit_for_bit() {
-    let (dimensions, mut config) = (dimensions(false), config(BasisKind::Estimate));
+    let (dimensions, mut config) = (dimensions(), config(BasisKind::Estimate));
     let learning = &mut config.learning;
     (learning.window, learning.block_windows, learning.streams) = (2, 1, 2);
     let mut learner = FilterLearner::new(dimensions, worlds(), &config);
@@ -315,7 +314,7 @@ fn a_learned_filter_resumes_bit_for_bit() {
 
 #[test]
 fn a_neural_belief_resumes_bit_for_bit() {
-    let filter = learned_filter(false);
+    let filter = learned_filter();
     for filter in [None, Some(&filter)] {
         let mut learner = neural(None, filter, worlds()).expect("new");
         learner.attach(vec![observation(0)]).expect("possible");

@@ -174,7 +174,10 @@ fn a_trajectory_is_the_same_on_every_platform() {
     let random = hash_after(&random_model(4, 4, [5, 5]), shape(7, 5), 10_000);
     assert_eq!(random, 0x4974_9562_5f3d_1a6d);
     let hazards = random_hazards(4, 4, [5, 5], Some((7, 5)));
-    assert_eq!(hash_after(&hazards, shape(7, 5), 10_000), 0x8f9c_f37e_fe43_b4e0);
+    assert_eq!(
+        hash_after(&hazards, shape(7, 5), 10_000),
+        0x8f9c_f37e_fe43_b4e0
+    );
 }
 
 #[test]

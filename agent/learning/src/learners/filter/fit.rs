@@ -4,9 +4,9 @@ mod neighbours;
 
 pub use self::neighbours::Neighbours;
 
-use crate::beliefs::learned::{LearnedModel, dimensions_of, named_tensors, read_parameters};
+use crate::beliefs::learned::{LearnedModel, checked, named_tensors, read_parameters};
 use crate::checkpoint::{Contents, check, check_counts, check_earned};
-use crate::config::{AgentConfig, KernelKind, LearningConfig};
+use crate::config::{AgentConfig, LearningConfig};
 use crate::gradient::{Optimiser, Update};
 use crate::learners::base::lacks_steps;
 use crate::replay::BlockReplay;
@@ -143,7 +143,7 @@ impl FilterFit {
             .collect()
     }
 
-    /// Loads the tensors from a checkpoint with the given dimensions, see [`dimensions_of`].
+    /// Loads the tensors from a checkpoint with the given dimensions, see [`checked`].
     ///
     /// # Errors
     /// If a tensor is missing or has another form. The error names it.
@@ -174,9 +174,7 @@ impl FilterFit {
         shape: Shape,
         config: &AgentConfig,
     ) -> Result<Self> {
-        let of_file = dimensions_of(dimensions, &contents.part(""))?;
-        let [expected, got] = [dimensions, of_file].map(|it| KernelKind::of(it.sees_own_state));
-        check(got == expected, "kernels", expected, got)?;
+        let dimensions = checked(dimensions, &contents.part(""))?;
         saved.load(contents, dimensions)?;
         let mut fit = Self::new(dimensions, shape, config);
         if saved.optimiser.cut() == fit.optimiser.cut() {
@@ -213,7 +211,6 @@ mod tests {
         n_states: 3,
         n_observations: 2,
         kernel: (1, 3),
-        sees_own_state: false,
     };
 
     fn shape() -> Shape {
@@ -320,7 +317,8 @@ mod tests {
                     .tensors
                     .insert("zones".into(), Tensor { shape, numbers });
             },
-            "zones: expected the same kernels in every cell, got kernels for each zone of land: train the filter again",
+            "kernel: expected the same weights in every cell, got kernels by own state or zone, which earlier releases \
+             learned: train the filter again",
         );
         forged(
             |contents, _| drop(contents.tensors.remove("initial.first_moment")),
