@@ -297,20 +297,11 @@ def test_a_team_is_drawn_with_paths_and_hovering_robots(studio: Studio) -> None:
     assert foot["flown"] < foot["some"] < foot["blank"]
 
 
-def test_zones_no_fly_cells_and_footprints_are_drawn(studio: Studio) -> None:
-    zone_map = [[0] * WIDTH, [0] * WIDTH, [1] * WIDTH]
-    zones = {"names": ["grass", "town"], "colors": ["#00ff00", "#ff00ff"], "map": zone_map}
-    no_fly = [[0, 0, 0, 0, 1]] * HEIGHT
-    airspace = {"radius": 1, "no_fly": no_fly}
+def test_no_fly_cells_and_footprints_are_drawn(studio: Studio) -> None:
+    airspace = {"radius": 1, "no_fly": [[0, 0, 0, 0, 1]] * HEIGHT}
     plain = studio.still([server(model=None), *both(1)])
-    land = [server(model=None, airspace=airspace, zones=zones), *both(1)]
-    image = studio.still(land)
-    rows = TOP + SCALE * np.arange(HEIGHT) + 6
-    unseen = image[rows, LEFTS[1] + SCALE * 2 + 5]
-    assert (unseen == [(0x88, 0xEE, 0x88)] * 2 + [(0xEE, 0x88, 0xEE)]).all()
+    image = studio.still([server(model=None, airspace=airspace), *both(1)])
     changed = (image[: TOP + 30] != plain[: TOP + 30]).any(axis=2)[TOP:]
     for left in LEFTS[:2]:
         assert changed[:, left + 40 : left + 50].any(axis=1).all(), "hatches"
     assert len(image) > len(plain), "a longer legend"
-    studio.film(land)
-    assert np.abs(studio.pictures()[0][rows, LEFTS[1] + 25] - unseen.astype(int)).max() <= 4

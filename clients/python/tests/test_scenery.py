@@ -1,4 +1,4 @@
-"""Zones, no-fly cells and cells seen beyond the path, in pictures."""
+"""No-fly cells and cells seen beyond the path, in pictures."""
 
 from itertools import product
 from typing import Any
@@ -8,15 +8,12 @@ from numpy.typing import NDArray
 
 from emberwatch.render import Palette, Picture, ansi, rgb_array
 from emberwatch.render.palette import mark_on
-from emberwatch.render.scenery import MOST_ZONES, Scenery
+from emberwatch.render.scenery import Scenery
 
 PALETTE = Palette.of(3)
 FRAME = np.array([[0, 255, 255], [2, 255, 1]], np.uint8)
 TRUTH = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
 NO_FLY = np.array([[False, True, False], [False, False, True]])
-ZONES = np.array([[0, 0, 1], [0, 0, 1]], np.uint8)
-LAND: dict[str, Any] = {"zones": ZONES, "zone_names": ("grass", "town")}
-LAND |= {"zone_colors": ((0, 100, 0), (200, 0, 200))}
 SCALE = 20
 GAP = 8
 
@@ -31,17 +28,6 @@ def cell(image: NDArray[np.uint8], row: int, col: int, left: int = 0) -> NDArray
     return image[top : top + SCALE, left : left + SCALE].reshape(-1, 3)
 
 
-def test_unseen_cells_have_the_muted_colour_of_their_zone() -> None:
-    plain, image = draw(), draw(**LAND)
-    for row, col in np.ndindex(FRAME.shape):
-        before, after = (cell(drawn, row, col)[0] for drawn in (plain, image))
-        if FRAME[row, col] != 255:
-            assert (after == before).all()
-        else:
-            color = np.array(LAND["zone_colors"][ZONES[row, col]])
-            assert (after == np.rint(0.4 * color + 0.6 * before)).all()
-
-
 def test_no_fly_cells_are_hatched_in_a_colour_that_stands_out() -> None:
     plain, image = draw(truth=True), draw(truth=True, no_fly=NO_FLY)
     for left, (row, col) in product((0, 3 * SCALE + GAP), np.ndindex(FRAME.shape)):
@@ -51,16 +37,6 @@ def test_no_fly_cells_are_hatched_in_a_colour_that_stands_out() -> None:
         ink = mark_on((before[0, 0], before[0, 1], before[0, 2]))
         assert (after[changed] == ink).all()
     assert (draw(scale=1, no_fly=NO_FLY) != draw(scale=1)).any(), "in cells of a pixel, too"
-
-
-def test_dots_separate_zones_unless_there_are_many() -> None:
-    plain, image = draw(truth=True), draw(truth=True, **LAND)
-    changed = (plain != image).any(axis=2)[:, 3 * SCALE + GAP :]
-    assert set(np.nonzero(changed)[1]) == {2 * SCALE - 1}
-    assert changed[:, 2 * SCALE - 1].mean() == 0.5
-    many = {"zone_names": ("grass",) * (MOST_ZONES + 1), "zone_colors": ((0, 0, 0),) * 9}
-    changed = (plain != draw(truth=True, **LAND | many)).any(axis=2)
-    assert not changed[:, 3 * SCALE + GAP :].any()
 
 
 def test_a_line_surrounds_cells_seen_beyond_the_path() -> None:

@@ -4,7 +4,7 @@ use super::codes::{Status, VERSION};
 use emberwatch_model::frame::Coverage;
 use serde::{Deserialize, Serialize};
 
-pub use super::hello::{AirspaceInfo, CoverageRule, RecordedWorld, ServerInfo, ZonesInfo};
+pub use super::hello::{AirspaceInfo, CoverageRule, RecordedWorld, ServerInfo};
 pub use super::json::{MAX_CONTROL_BYTES, parse};
 
 /// Maximum size of a part of a belief in one message, in bytes before the base64 encoding.

@@ -1,7 +1,7 @@
-//! The answer to `hello`: a server's settings, airspace and zones.
+//! The answer to `hello`: a server's settings and airspace.
 
 use emberwatch_model::grid::{Grid, Shape, ShapeError};
-use emberwatch_model::{Airspace, MAX_RADIUS, parse_color};
+use emberwatch_model::{Airspace, MAX_RADIUS};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -45,9 +45,6 @@ pub struct ServerInfo {
     /// path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub airspace: Option<AirspaceInfo>,
-    /// The zone of each cell, if there are several zones. It is for display only, and learners do not read it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub zones: Option<ZonesInfo>,
     /// The recorded sequences, if the hidden states were recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recorded_world: Option<RecordedWorld>,
@@ -130,17 +127,6 @@ pub struct AirspaceInfo {
     pub no_fly: Option<Vec<Vec<u8>>>,
 }
 
-/// The zones of the grid. The states of cells change differently in each zone.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ZonesInfo {
-    /// The name of each zone.
-    pub names: Vec<String>,
-    /// The colour of each zone in pictures, `#rrggbb`.
-    pub colors: Vec<String>,
-    /// The zone of each cell, row by row.
-    pub map: Vec<Vec<u8>>,
-}
-
 impl AirspaceInfo {
     /// Returns where robots on a grid may fly and what they see.
     ///
@@ -159,28 +145,6 @@ impl AirspaceInfo {
             .transpose()?;
         let no_fly = no_fly.map(|map| Arc::new(map.mapv(|flag| flag != 0)));
         Ok(Airspace::new(shape, no_fly, radius))
-    }
-}
-
-impl ZonesInfo {
-    /// Returns the zone of each cell of a grid, shape `[H, W]`.
-    ///
-    /// # Errors
-    /// If the map does not fit the grid, or a zone has no name or colour. The error contains the expected value.
-    pub fn zone_map(&self, shape: Shape) -> Result<Grid<u8>, String> {
-        let map = of_grid("zones", shape, &self.map)?;
-        let n_zones = self.names.len();
-        let is_color = |color: &String| parse_color(color).is_some();
-        if self.colors.len() != n_zones || !self.colors.iter().all(is_color) {
-            let got = &self.colors;
-            return Err(format!(
-                "zones: expected {n_zones} colours #rrggbb, got {got:?}"
-            ));
-        }
-        match map.iter().find(|&&zone| usize::from(zone) >= n_zones) {
-            None => Ok(map),
-            Some(got) => Err(format!("zones: expected values below {n_zones}, got {got}")),
-        }
     }
 }
 

@@ -7,7 +7,7 @@ use crate::world::WorldOutcome;
 use emberwatch_messages::capacity::MAX_CLIENTS;
 use emberwatch_messages::control::{
     AirspaceInfo, LeaseInfo, RecordedWorld, Reply, Request, ServerInfo, ServerStatus, WorldSeed,
-    WorldStatus, ZonesInfo, parse,
+    WorldStatus, parse,
 };
 use emberwatch_messages::message::{Status, VERSION};
 use emberwatch_messages::process::pid_namespace;
@@ -258,7 +258,6 @@ impl Simulator {
             task: self.checked.task.as_ref().map(|task| task.name.clone()),
             worlds_fingerprint: Some(self.spec.settings.worlds_fingerprint()),
             airspace: airspace_info(&self.checked.model),
-            zones: zones_info(&self.checked.model),
             recorded_world: recorded.as_ref().map(|states| RecordedWorld {
                 description: config.reveal_model.then(|| states.description.clone()),
                 n_sequences: states.recorded.n_sequences(),
@@ -303,17 +302,6 @@ fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
         no_fly: model.file().no_fly.as_ref().and_then(CellMap::rows),
     };
     (info.radius > 0 || info.no_fly.is_some()).then_some(info)
-}
-
-/// Describes the model's zones. Returns `None` if it has none.
-fn zones_info(model: &Model) -> Option<ZonesInfo> {
-    let file = model.file();
-    let map = file.zone_map.as_ref()?;
-    Some(ZonesInfo {
-        names: file.zones.iter().map(|zone| zone.name.clone()).collect(),
-        colors: file.zones.iter().map(|zone| zone.color.clone()).collect(),
-        map: map.rows()?,
-    })
 }
 
 /// Checks the version of a message and parses its request.

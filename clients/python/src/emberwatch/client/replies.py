@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from emberwatch.client.wire import Shape
 from emberwatch.errors import bad_answer, invalid, repr_of
-from emberwatch.model import Description, color_from_hex
-from emberwatch.model.airspace import Airspace, Zones
+from emberwatch.model import Description
+from emberwatch.model.airspace import Airspace
 
 _Record = TypeVar("_Record")
 
@@ -78,8 +78,6 @@ class ServerInfo:
     pid_namespace: int | None = None
     #: Where robots may fly and what they see.
     airspace: Airspace = Airspace()  # noqa: RUF009
-    #: The zones of land; None if there are no zones.
-    zones: Zones | None = None
 
     @property
     def recorded_states(self) -> Description | None:
@@ -185,7 +183,7 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
-        if name in ("airspace", "zones"):
+        if name == "airspace":
             continue
         if name in ("pid_namespace", "task", "worlds_fingerprint") and name not in given:
             continue
@@ -200,40 +198,32 @@ def record(kind: type[_Record], keys: Any) -> _Record:
             raise bad_answer("reply", f"another {name!r}", repr_of(value))
         values[name] = value
     if kind is ServerInfo:
-        values |= _land(given, (values["height"], values["width"]))
+        shape = values["height"], values["width"]
+        values["airspace"] = _airspace(given.get("airspace"), shape)
     return kind(**values)
 
 
-def _land(given: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Airspace | Zones]:
-    """Parses airspace and zones of the answer to `hello`; both may be missing."""
-    land: dict[str, Airspace | Zones] = {}
-    airspace, zones = given.get("airspace"), given.get("zones")
+def _airspace(given: Any, shape: tuple[int, int]) -> Airspace:
+    """Parses the airspace of the answer to `hello`, which may be missing."""
+    if given is None:
+        return Airspace()
     try:
-        if airspace is not None:
-            rows = airspace.get("no_fly")
-            no_fly = None if rows is None else _cells("no_fly", rows, shape, 2) != 0
-            land["airspace"] = Airspace(radius=airspace["radius"], no_fly=no_fly)
-        if zones is not None:
-            names, colors = (tuple(map(str, zones[name])) for name in ("names", "colors"))
-            if len(names) != len(tuple(map(color_from_hex, colors))):
-                raise invalid("colors", len(names), len(colors))
-            cells = _cells("map", zones["map"], shape, len(names))
-            land["zones"] = Zones(names=names, colors=colors, map=cells)
+        rows = given.get("no_fly")
+        no_fly = None if rows is None else _no_fly(rows, shape)
+        return Airspace(radius=given["radius"], no_fly=no_fly)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise bad_answer("reply", "'airspace' and 'zones' of the grid", error) from None
-    return land
+        raise bad_answer("reply", "an 'airspace' of the grid", error) from None
 
 
-def _cells(what: str, rows: Any, shape: tuple[int, int], n_values: int) -> NDArray[np.uint8]:
-    """Parses a map of the grid from its rows of numbers below `n_values`."""
+def _no_fly(rows: Any, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Parses the no-fly map of the grid from its rows of 0 and 1."""
     try:
         cells = np.array(rows)
     except ValueError:  # rows differ in length
         cells = np.empty(0)
-    is_map = cells.shape == shape and cells.dtype.kind == "i"
-    if not is_map or ((cells < 0) | (cells >= n_values)).any():
-        raise invalid(what, f"integers below {n_values} of shape {shape}", repr_of(rows))
-    return cells.astype(np.uint8)
+    if cells.shape != shape or cells.dtype.kind != "i" or not np.isin(cells, (0, 1)).all():
+        raise invalid("no_fly", f"0 and 1 of shape {shape}", repr_of(rows))
+    return cells != 0
 
 
 def _as_tuples(value: Any) -> Any:

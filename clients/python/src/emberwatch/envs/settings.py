@@ -21,7 +21,7 @@ from emberwatch.common.arguments import read_settings
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model import Description, Model
-from emberwatch.model.airspace import Airspace, Zones
+from emberwatch.model.airspace import Airspace
 from emberwatch.model.tasks import Task, built_in_tasks
 
 #: Drawn seeds are below this number, so that every JSON reader represents them exactly (PROTOCOL.md
@@ -211,8 +211,6 @@ class WorldSpec:
     burn_in: int
     #: Where robots may fly and what they see.
     airspace: Airspace
-    #: Zones of land, for pictures; None if there are no zones.
-    zones: Zones | None
     #: Number of robots in each world.
     n_robots: int
     #: Whether the hidden states come from recorded states instead of a model.
@@ -266,7 +264,6 @@ def own_spec(
         n_observations=described.n_observations,
         burn_in=checked["burn_in"],
         airspace=described.airspace,
-        zones=described.zones if isinstance(described, Model) else None,
         n_robots=n_robots,
         is_recorded=bool(checked["states"]),
         description=described if checked["states"] else None,
@@ -324,7 +321,6 @@ def running_spec(
         n_observations=info.n_observations,
         burn_in=info.burn_in,
         airspace=info.airspace,
-        zones=info.zones,
         n_robots=info.n_robots,
         is_recorded=info.recorded_world is not None,
         description=description,

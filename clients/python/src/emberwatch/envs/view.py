@@ -27,7 +27,7 @@ class View:
                 "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr_of(render_mode)
             )
         self.mode: Final = render_mode
-        self._scenery: Final = Scenery.of(spec.airspace, spec.zones)
+        self._scenery: Final = Scenery.of(spec.airspace)
         self._palette: Final = Palette.of(spec.described or spec.n_observations)
         self._screen: Screen | None = None
 

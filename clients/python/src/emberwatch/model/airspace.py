@@ -39,23 +39,3 @@ class Airspace:
     def _values(self) -> tuple[object, ...]:
         no_fly = None if self.no_fly is None else self.no_fly.tolist()
         return self.radius, no_fly
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Zones:
-    """Zones of land, which differ in their transition kernels."""
-
-    names: tuple[str, ...]
-    #: One colour for each zone, as `#rrggbb`.
-    colors: tuple[str, ...]
-    #: The zone of each cell, as an index into `names`, shape (H, W).
-    map: NDArray[np.uint8]
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Zones) and self._values() == other._values()
-
-    def __hash__(self) -> int:
-        return hash(self.names)
-
-    def _values(self) -> tuple[object, ...]:
-        return self.names, self.colors, self.map.tolist()

@@ -65,7 +65,7 @@ class Picture:
             palette: The colours.
             paths: The visited cells of each robot that flew, in order.
             truth: The hidden states, shape (H, W); None: unknown.
-            scenery: The zones and no-fly cells of the grid.
+            scenery: The no-fly cells of the grid, and the sensor's range.
         """
         if frame.ndim != 2 or not frame.size:
             raise invalid("frame", "shape (H, W)", frame.shape)
@@ -85,11 +85,6 @@ class Picture:
                 at = int(np.argmax(jumps))
                 got = [tuple(cell) for cell in path[at : at + 2].tolist()]
                 raise invalid("path", "consecutive cells to be neighbours", got)
-
-    def painted(self) -> NDArray[np.uint8]:
-        """Returns the colour of each cell of the frame, shape (H, W, 3)."""
-        colors = self.palette.paint_frame(self.frame)
-        return self.scenery.tint(colors, self.frame, self.palette.unobserved)
 
     def color_of(self, robot: int) -> Color | None:
         """Returns the colour of a robot of a team; None for a single robot."""
@@ -117,7 +112,7 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
     if scale < 1:
         raise invalid("scale", "at least 1 pixel", scale)
-    colors = picture.painted()
+    colors = palette.paint_frame(picture.frame)
     if scale < LEAST_LINE_SCALE:
         panels = [_enlarge(_tinted(colors, _visited(picture)), scale)]
         picture.scenery.draw(panels[0], picture.frame, scale)
@@ -146,7 +141,7 @@ def ansi(picture: Picture, *, color: bool = True) -> str:
     is ``@`` for a robot, ``*`` for a path, ``x`` for a no-fly cell, otherwise a space.
     """
     palette, cells, robots = picture.palette, _visited(picture), _cells(picture.robots)
-    grids = [(picture.frame, picture.painted(), cells)]
+    grids = [(picture.frame, picture.palette.paint_frame(picture.frame), cells)]
     if picture.truth is not None:
         grids.append((picture.truth, palette.paint_truth(picture.truth), cells[:0]))
     if not color:

@@ -16,7 +16,7 @@ from emberwatch.model import Color, Model
 from emberwatch.render import LEAST_LINE_SCALE, Picture, rgb_array
 from emberwatch.render.film.scenes import Scene
 from emberwatch.render.palette import DARK, LIGHT, ROBOTS, Palette
-from emberwatch.render.scenery import MOST_ZONES, Scenery
+from emberwatch.render.scenery import Scenery
 
 _MARGIN, _GAP, _LINE, _SWATCH = 14, 16, 20, 11  # pixels
 _TOP = 68  # y of the panels, below step and titles, pixels
@@ -32,7 +32,7 @@ _FINE = 4  # factor by which texts are drawn larger, and then reduced
 _TEXT = cast("ImageFont.FreeTypeFont", ImageFont.load_default(13 * _FINE))
 _TITLE = cast("ImageFont.FreeTypeFont", ImageFont.load_default(16 * _FINE))
 
-_Mark = Color | Literal["robot", "scale", "no-fly", "words"]
+_Mark = Color | Literal["robot", "scale", "no-fly"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,12 +64,12 @@ class Page:
         self._scale = scale or min(max(_LONG_SIDE // max(height, width), 1), _MOST_SCALE)
         self._grid = height * self._scale, width * self._scale
         self._room = max(_LEAST_ROOM, self._grid[1])
-        self._scenery = scenery = Scenery.of(server.airspace, server.zones)
+        self._scenery = scenery = Scenery.of(server.airspace)
         source = described or server.n_observations
         palette = Palette.of(source, on_paper=True)
         names = (described.state_names if described else (), server.observations)
         self._panels = _panels(palette, names, model, scenery, has_truth=has_truth)
-        self.palette = _film_palette(palette, scenery)
+        self.palette = _film_palette(palette)
         n_panels = len(self._panels)
         bottom = _TOP + self._grid[0] + 6
         legends = [self._placed(panel.marks) for panel in self._panels]
@@ -163,7 +163,7 @@ class Page:
             draw.rectangle((x + 11, top - 1, x + 76, bottom + 1), outline=_EDGE)
             for column, color in enumerate(_ramp(64), x + 12):
                 draw.line((column, top, column, bottom), color)
-        elif mark != "words":
+        else:
             draw.rectangle((x, top, x + _SWATCH - 1, bottom), mark, outline=_EDGE)
         _write(self._base, (x + _width(mark), y), name)
 
@@ -200,14 +200,13 @@ def _fit(text: str, room: float) -> str:
     return f"{text}…" if text else ""
 
 
-def _film_palette(palette: Palette, scenery: Scenery) -> Image.Image:
-    """Returns the colours of cells, marks and text: at most 256, so the last zones may lack one."""
+def _film_palette(palette: Palette) -> Image.Image:
+    """Returns the colours of cells, marks and text, at most 256."""
     cells = np.array([*palette.observations, palette.unobserved])
     inks = np.linspace(LIGHT, [_INK, _WARNING], 8).reshape(-1, 3)
     marks = np.array([DARK, LIGHT, _EDGE, *ROBOTS, *palette.states, *_ramp(_SHADES)])
     image = Image.new("P", (1, 1))
-    tints = np.array(scenery.tints(palette.unobserved)).reshape(-1, 3)
-    colors = np.concatenate([cells, marks, inks, tints])[:256]
+    colors = np.concatenate([cells, marks, inks])[:256]
     image.putpalette(colors.astype(np.uint8).tobytes())
     return image
 
@@ -260,19 +259,9 @@ def _panels(
 
 
 def _land(palette: Palette, scenery: Scenery) -> list[tuple[_Mark, str]]:
-    """Returns the legend of unseen cells, by zone, and of no-fly cells."""
-    names = scenery.zone_names
-    marks: list[tuple[_Mark, str]] = []
-    if not names:
-        marks.append((palette.unobserved, "not seen"))
-    elif len(names) > MOST_ZONES:
-        marks.append(("words", f"not seen: {len(names)} zones"))
-    else:
-        marks.append(("words", "not seen:"))
-        marks += zip(scenery.tints(palette.unobserved), names, strict=True)
-    if scenery.no_fly is not None:
-        marks.append(("no-fly", "no-fly"))
-    return marks
+    """Returns the legend of unseen cells and of no-fly cells."""
+    unseen: list[tuple[_Mark, str]] = [(palette.unobserved, "not seen")]
+    return unseen + ([] if scenery.no_fly is None else [("no-fly", "no-fly")])
 
 
 def _levels(shares: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -289,8 +278,6 @@ def _ramp(n_colors: int) -> tuple[Color, ...]:
 
 def _width(mark: _Mark) -> int:
     """Returns the width of a mark and the space after it, pixels."""
-    if mark == "words":
-        return 0
     return 12 + 64 + 6 if mark == "scale" else _SWATCH + 5
 
 
