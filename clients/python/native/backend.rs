@@ -7,6 +7,7 @@ use crate::wire::Connection;
 use emberwatch_messages::backend::Backend;
 use emberwatch_messages::limits::threads::spawn;
 use emberwatch_model::Model;
+use emberwatch_model::hazards::Hazards;
 use emberwatch_sim::config::{Checked, ServerConfig, model_named};
 use emberwatch_sim::embedded::{Embedded, wait_for};
 use emberwatch_sim::snapshot::Settings;
@@ -179,12 +180,14 @@ pub fn model_text(py: Python<'_>, name: String) -> PyResult<String> {
     let paths = [name.clone()];
     let model = in_time(py, &paths, move || model_named(&name))?;
     let model = model.map_err(|problem| refused(py, problem))?;
-    let file = model.file();
-    let map = file.zone_map.as_ref().or(file.no_fly.as_ref());
-    let (height, width) = map
-        .and_then(|map| map.grid().ok())
-        .map_or((64, 64), |map| map.dim());
-    let shape = shape_of(py, height, width)?;
+    let no_fly = model.file().no_fly.as_ref().and_then(|map| map.grid().ok());
+    let shape = match model.hazards().and_then(Hazards::shape) {
+        Some(shape) => shape,
+        None => {
+            let (height, width) = no_fly.map_or((64, 64), |map| map.dim());
+            shape_of(py, height, width)?
+        }
+    };
     model
         .check_on(shape)
         .map_err(|problem| refused(py, problem))?;

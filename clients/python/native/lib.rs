@@ -30,6 +30,7 @@ mod wire;
 
 use emberwatch_messages::interrupt::interrupt_when;
 use emberwatch_model::grid::MAX_SIDE;
+use emberwatch_model::maps::{MAX_ARCHIVE_BYTES, MAX_MAP_VALUES};
 use emberwatch_model::path::MAX_MOVES;
 use emberwatch_model::task::FIRST_TRAINING_SEED;
 use emberwatch_model::{MAX_RADIUS, MAX_VALUES};
@@ -67,6 +68,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(prior::simulated_prior, module)?)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;
     module.add("FIRST_TRAINING_SEED", FIRST_TRAINING_SEED)?;
+    module.add("MAX_ARCHIVE_BYTES", MAX_ARCHIVE_BYTES)?;
+    module.add("MAX_MAP_VALUES", MAX_MAP_VALUES)?;
     module.add("MAX_MOVES", MAX_MOVES)?;
     module.add("MAX_RADIUS", MAX_RADIUS)?;
     module.add("MAX_SIDE", MAX_SIDE)?;

@@ -2,11 +2,11 @@
 
 use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
+use emberwatch_model::hazards::Hazards;
 use emberwatch_model::task::Task;
 use emberwatch_model::{CellMap, Description, Model, parse_color};
 use emberwatch_sim::states_file::StatesFile;
 use numpy::ToPyArray;
-use numpy::ndarray::{Axis, stack};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
@@ -29,17 +29,17 @@ pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &
 pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = model_of(text)?;
     let fields = described(py, &model)?;
-    let views: Vec<_> = model.kernels().iter().map(|kernel| kernel.view()).collect();
-    let kernels = stack(Axis(0), &views).expect("invariant: kernels have one size");
-    fields.set_item("kernels", kernels.to_pyarray(py))?;
-    fields.set_item("bias", model.bias().to_pyarray(py))?;
+    let ratio = model.ratio();
+    fields.set_item("kernel", ratio.map(|it| it.kernel().to_pyarray(py)))?;
+    fields.set_item("bias", ratio.map(|it| it.bias().to_pyarray(py)))?;
     fields.set_item("initial", model.initial().to_pyarray(py))?;
     fields.set_item("edge", model.edge())?;
-    let zones = model.file().zones.iter();
-    fields.set_item("zone_names", names(py, zones.clone().map(|it| &it.name))?)?;
-    fields.set_item("zone_colors", colors(py, zones.map(|it| &it.color))?)?;
-    let zone_map = model.zone_map().map(|map| map.to_pyarray(py));
-    fields.set_item("zone_map", zone_map)?;
+    let transitions = model.file().transitions.iter();
+    let transitions = transitions.map(|it| (&it.from, &it.to, it.base, &it.near, &it.times));
+    fields.set_item("transitions", transitions.collect::<Vec<_>>())?;
+    let maps = model.hazards().into_iter().flat_map(Hazards::maps);
+    let maps = maps.map(|(name, map)| (name, map.to_pyarray(py)));
+    fields.set_item("maps", maps.collect::<BTreeMap<_, _>>())?;
     Ok(fields)
 }
 

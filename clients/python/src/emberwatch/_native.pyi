@@ -51,6 +51,12 @@ VERSION: str
 #: Smallest training seed. Worlds with smaller seeds are for tests: do not train or tune on them.
 FIRST_TRAINING_SEED: int
 
+#: Maximum size of a model's archive of maps, in bytes.
+MAX_ARCHIVE_BYTES: int
+
+#: Maximum number of values in all maps of a model.
+MAX_MAP_VALUES: int
+
 #: Maximum number of moves in a path.
 MAX_MOVES: int
 

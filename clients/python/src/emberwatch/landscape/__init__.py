@@ -7,7 +7,7 @@ size of cells on the ground (with pyproj). `lengths` defines units, `grid` check
 resamples. `fire` converts times, masks or codes to states, `world` writes the files for
 `emberwatch-server --states`, `picture` draws the states, and `__main__` parses the flags.
 
-`python -m emberwatch.landscape land` makes model files with zones. `elevation` computes slopes,
-`terrain` groups cells into zones and implements the formula for slope and wind, `compass` parses
-directions, `zoned` makes the kernels of each zone, and `land` parses the flags.
+`python -m emberwatch.landscape land` makes model files with maps. `elevation` computes slopes,
+`terrain` implements the formula for slope and wind and writes the model file, `compass` parses
+directions, and `land` parses the flags.
 """

@@ -38,7 +38,7 @@ examples:
   python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" \\
       --out world.npz
 
-`python -m emberwatch.landscape land` makes a model file with zones from elevation and wind.
+`python -m emberwatch.landscape land` makes a model file from elevation, wind and fuel.
 """
 #: Flags that apply only to some values of `--kind`.
 _ONLY_FOR: Final = {

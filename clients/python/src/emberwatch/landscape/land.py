@@ -1,7 +1,7 @@
-"""`python -m emberwatch.landscape land`: makes a model file with zones of elevation and wind."""
+"""`python -m emberwatch.landscape land`: makes a model with maps of slope, wind and fuel."""
 
 import argparse
-import tomllib
+import io
 from collections.abc import Sequence
 from contextlib import closing
 from itertools import islice
@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch._native import MAX_SIDE
+from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES, MAX_SIDE
 from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.compass import POINTS, bearing
@@ -20,10 +20,8 @@ from emberwatch.landscape.grid import check_same
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice, Layer
 from emberwatch.landscape.lengths import METRES, side
-from emberwatch.landscape.terrain import Zone, zones
+from emberwatch.landscape.terrain import model_text, slope_and_wind
 from emberwatch.landscape.world import Fill, check_new, write
-from emberwatch.landscape.zoned import Table, check_base, kernels, toml
-from emberwatch.model import Model
 
 _NAME: Final = "python -m emberwatch.landscape land"
 _EXAMPLES: Final = """
@@ -33,14 +31,12 @@ examples:
   # Heights in feet, and a wind from the west-south-west:
   python -m emberwatch.landscape land dem.tif --height-unit ft --wind-speed 5 --wind-from WSW \\
       --out hills.toml
-  # Your own zones, with rivers in zones 7 and 8, and no-fly cells over towns:
-  python -m emberwatch.landscape land --zones fuel.tif --unburnable 7,8 --no-fly towns.tif \\
-      --out fuels.toml
+  # Fuels, of which 3 burns twice as well as others and 7 and 8 never, and no-fly cells over towns:
+  python -m emberwatch.landscape land --fuel fuel.tif --factors 3=2 --unburnable 7,8 \\
+      --no-fly towns.tif --out fuels.toml
 """
-#: Maximum number of cells of a map inside the model file, whose maximum size is 16 MiB. Larger maps
-#: are written to a `.npy` file.
-_MOST_INLINE: Final = 1 << 16
-_MOST_NUMBER: Final = 10**15  # maximum number of a zone; doubles represent all integers up to it
+_MOST_NUMBER: Final = 10**15  # maximum class of fuel; doubles represent all integers up to it
+_MOST_FACTOR: Final = 1e6  # maximum factor of a map
 _MOST_WIND: Final = 100.0  # maximum wind speed, m/s: more than any hurricane
 
 
@@ -57,7 +53,7 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a model file with zones from rasters: GeoTIFF (.tif), ESRI ASCII grid "
+        description="Make a model file with maps from rasters: GeoTIFF (.tif), ESRI ASCII grid "
         "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/land.md describes the rules and "
         "the formula.",
         epilog=_EXAMPLES,
@@ -65,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
-    add("--out", type=Path, required=True, metavar="FILE.toml", help="the model file")
+    add("--out", type=Path, required=True, metavar="FILE.toml", help="the model file; its maps go to FILE.npz")
     add(
         "--cell",
         metavar="METRES",
@@ -77,7 +73,6 @@ def _parser() -> argparse.ArgumentParser:
         help="unit of the heights [the raster's, or m]",
     )
     add("--oblong", action="store_true", help="allow cells that are not square or differ in size")
-    add("--slope-step", type=float, metavar="DEGREES", help="width of the classes of slope [5]")
     add("--wind-speed", type=float, default=0.0, metavar="M/S", help="speed of the wind [0]")
     add(
         "--wind-towards",
@@ -92,32 +87,25 @@ def _parser() -> argparse.ArgumentParser:
         help="instead of --wind-towards: where the wind comes from, as in weather reports: N, "
         "NNE, ..., or degrees clockwise from the north",
     )
-    add("--zones", type=Path, metavar="RASTER", help="whole numbers, each a separate zone")
+    add("--fuel", type=Path, metavar="RASTER", help="whole numbers, each a class of fuel")
     add(
-        "--missing-zone",
+        "--factors",
+        type=_factors,
+        metavar="N=X,N=X",
+        help="factors by which classes of --fuel multiply the hazard of fire [1]",
+    )
+    add("--unburnable", type=_classes, metavar="N,N", help="classes of --fuel that never burn")
+    add(
+        "--missing-class",
         type=int,
         metavar="N",
-        help="zone of the cells that have no value in --zones",
+        help="class of the cells that have no value in --fuel",
     )
-    add("--unburnable", type=_values, metavar="N,N", help="zones of --zones that never burn")
     add(
         "--no-fly",
         type=Path,
         metavar="RASTER",
         help="cells with a number other than 0 are no-fly cells",
-    )
-    add(
-        "--model",
-        default="wildfire-burnout",
-        metavar="NAME|FILE",
-        help="the base model, whose kernels are adapted to each zone [wildfire-burnout]",
-    )
-    add("--state", metavar="NAME", help="the state that spreads [the one that pays most]")
-    add(
-        "--base-wind",
-        action="store_true",
-        help="keep the base model's preferred directions. Without this flag, ELEVATION or wind "
-        "replace them: neighbours at the same distance first get the mean of their weights",
     )
     add("--variable", metavar="NAME", help="the variable, if a NetCDF or .npz file has several")
     add("--band", type=int, metavar="N", help="the band, if a raster has several")
@@ -131,7 +119,8 @@ def _make(flags: argparse.Namespace) -> None:
     _check_flags(flags)
     name = utf8("--name", flags.name or flags.out.stem)
     check_new("--out", flags.out, force=flags.force)
-    base, layers = _base(flags), _layers(flags)
+    layers = _layers(flags)
+    shape = next(iter(layers.values())).place.shape
     slope = None
     if "elevation" in layers:
         slope = slopes(
@@ -140,25 +129,19 @@ def _make(flags: argparse.Namespace) -> None:
             height_unit=flags.height_unit,
             oblong=flags.oblong,
         )
-    cells, found = _zones(flags, layers, None if slope is None else slope.rise)
-    is_changed = flags.elevation is not None or flags.wind_speed > 0.0
-    check_base(base, found, flags.state, is_changed=is_changed)
-    maps = {"zone_map": cells} | _no_fly(layers)
-    contents = dict[Path, Fill]()
-    model: Table = {"name": name, "kernel_size": base["kernel_size"]}
-    model |= {key: _map(key, array, flags, contents) for key, array in maps.items()}
-    model |= {"zones": [{"name": zone.name, "color": zone.color} for zone in found]}
-    model |= {key: value for key, value in base.items() if key not in ("name", "kernel")}
-    wind, is_even = (flags.wind_speed, flags.wind_towards), is_changed and not flags.base_wind
-    entries = [kernels(base, zone, flags.state, *wind, is_even=is_even) for zone in found]
-    model |= {"kernel": [entry for some in entries for entry in some]}
+    rise = np.zeros((2, *shape)) if slope is None else slope.rise
+    maps = {"slope_wind": slope_and_wind(rise, flags.wind_speed, flags.wind_towards)}
+    if "fuel" in layers:
+        maps = {"fuel": _fuel(flags, layers["fuel"])} | maps
+    maps = {key: _rounded(factors) for key, factors in maps.items() if (factors != 1.0).any()}
     notes = [] if slope is None else slope.notes
+    contents = _files(flags, maps, layers.get("no_fly"))
+    files = {key: utf8("--out", file.name) for key, (file, _) in contents.items()}
     comments = "".join(f"# {line}\n" for line in (_origin(flags, layers), *notes))
-    text = f"{comments}\n{toml(model)}".encode()
-    contents[flags.out] = lambda file: file.write(text)
-    write(contents)
-    height, width = cells.shape
-    print(shown(f"{flags.out}: {height} x {width} cells, zones: {len(found)}"))
+    text = f"{comments}\n{model_text(name, files, list(maps))}".encode()
+    write(dict(contents.values()) | {flags.out: lambda file: file.write(text)})
+    height, width = shape
+    print(shown(f"{flags.out}: {height} x {width} cells, maps: {', '.join(maps) or 'none'}"))
     for note in notes:
         print(shown(f"{flags.elevation}: {note}"))
     if "no_fly" in layers:
@@ -168,23 +151,22 @@ def _make(flags: argparse.Namespace) -> None:
 def _check_flags(flags: argparse.Namespace) -> None:
     if flags.out.suffix != ".toml":
         raise invalid("--out", "a .toml file", flags.out)
-    if (flags.elevation, flags.zones, flags.no_fly) == (None, None, None):
+    if (flags.elevation, flags.fuel, flags.no_fly) == (None, None, None):
         raise InvalidArgumentError(
-            "rasters: expected at least one of ELEVATION, --zones and --no-fly, got none"
+            "rasters: expected at least one of ELEVATION, --fuel and --no-fly, got none"
         )
-    needs = dict.fromkeys(("cell", "height_unit", "oblong", "slope_step"), "elevation")
-    needs |= dict.fromkeys(("unburnable", "missing_zone"), "zones")
+    needs = dict.fromkeys(("cell", "height_unit", "oblong"), "elevation")
+    needs |= dict.fromkeys(("factors", "unburnable", "missing_class"), "fuel")
     for flag, needed in needs.items():
         value = getattr(flags, flag)
         if value is not None and value is not False and getattr(flags, needed) is None:
-            word = "ELEVATION" if needed == "elevation" else "--zones"
+            word = "ELEVATION" if needed == "elevation" else "--fuel"
             raise InvalidArgumentError(f"--{flag.replace('_', '-')}: applies only with {word}")
-    flags.slope_step = 5.0 if flags.slope_step is None else flags.slope_step
-    if not 0.1 <= flags.slope_step <= 90.0:
-        raise invalid("--slope-step", "0.1 to 90 degrees", flags.slope_step)
+    if flags.fuel is not None and (flags.factors, flags.unburnable) == (None, None):
+        raise InvalidArgumentError("--fuel: expected --factors or --unburnable with it, got neither")
     flags.cell = None if flags.cell is None else side("--cell", flags.cell)
-    if flags.missing_zone is not None and abs(flags.missing_zone) > _MOST_NUMBER:
-        raise invalid("--missing-zone", f"at most {_MOST_NUMBER}", flags.missing_zone)
+    if flags.missing_class is not None and abs(flags.missing_class) > _MOST_NUMBER:
+        raise invalid("--missing-class", f"at most {_MOST_NUMBER}", flags.missing_class)
     _check_wind(flags)
 
 
@@ -210,21 +192,11 @@ def _check_wind(flags: argparse.Namespace) -> None:
         raise invalid("--wind-towards", "-360 to 360 degrees", flags.wind_towards)
 
 
-def _base(flags: argparse.Namespace) -> Table:
-    """Returns the base model's file; sets `flags.state` to the state that spreads."""
-    model = Model.named(flags.model)
-    if flags.state is None:
-        flags.state = model.state_names[model.target_state]
-        if not model.reward.max() > 0.0:
-            raise invalid("--state", "the state that spreads, as no state pays", "none")
-    return tomllib.loads(model.toml)
-
-
 def _layers(flags: argparse.Namespace) -> dict[str, Layer]:
     """Reads the rasters, by the names of their flags; refuses rasters on different grids."""
     choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
     layers = dict[str, Layer]()
-    for key in ("elevation", "zones", "no_fly"):
+    for key in ("elevation", "fuel", "no_fly"):
         file = getattr(flags, key)
         if file is not None:
             layers[key] = layer = _layer(file, choice)
@@ -242,30 +214,46 @@ def _check_grid(layer: Layer, first: Layer) -> None:
         check_same(layer.place, layer.name, first.place, first.name)
 
 
-def _zones(
-    flags: argparse.Namespace, layers: dict[str, Layer], rise: NDArray[np.float64] | None
-) -> tuple[NDArray[np.uint8], list[Zone]]:
-    """Computes the zone of each cell, and the zones."""
-    values = _whole(layers["zones"], flags.missing_zone) if "zones" in layers else None
-    unburnable = flags.unburnable or ()
-    missing = set(unburnable).difference(() if values is None else values.flat)
+def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:
+    """Returns the factor of each cell's class of fuel, shape (H, W)."""
+    classes, places = np.unique(_whole(layer, flags.missing_class), return_inverse=True)
+    table: dict[int, float] = (flags.factors or {}) | dict.fromkeys(flags.unburnable or (), 0.0)
+    missing = set(table).difference(classes.tolist())
     if missing:
-        raise invalid("--unburnable", f"values that occur in {flags.zones}", min(missing))
-    shape = next(iter(layers.values())).place.shape
-    return zones(rise, values, shape=shape, step=flags.slope_step, unburnable=unburnable)
+        expected = f"classes that occur in {flags.fuel}"
+        raise invalid("--factors and --unburnable", expected, min(missing))
+    factors = np.array([table.get(one, 1.0) for one in classes.tolist()])
+    return factors[places].reshape(layer.place.shape)
 
 
-def _no_fly(layers: dict[str, Layer]) -> dict[str, NDArray[np.uint8]]:
-    """Returns the map of no-fly cells, by its key in the model file.
+def _rounded(factors: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Rounds to three digits, because no factor is known more precisely."""
+    digits = 10.0 ** (2 - np.floor(np.log10(np.where(factors > 0.0, factors, 1.0))))
+    return (np.rint(factors * digits) / digits).astype(np.float32)
 
-    Cells without a value are free, because rasters made from polygons have no values outside them.
-    """
-    if "no_fly" not in layers:
-        return {}
-    cells = np.nan_to_num(layers["no_fly"].values, nan=0.0) != 0.0
-    if cells.all():
-        raise invalid(layers["no_fly"].name, "a cell of 0, where robots may be", "none")
-    return {"no_fly": cells.astype(np.uint8)}
+
+def _files(
+    flags: argparse.Namespace, maps: dict[str, NDArray[np.float32]], no_fly: Layer | None
+) -> dict[str, tuple[Path, Fill]]:
+    """Returns the files next to the model file and their contents, by key of the model file."""
+    files = dict[str, tuple[Path, Fill]]()
+    if maps:
+        archive, n_values = io.BytesIO(), sum(factors.size for factors in maps.values())
+        np.savez_compressed(archive, **maps)  # pyright: ignore
+        content = archive.getvalue()
+        if n_values > MAX_MAP_VALUES or len(content) > MAX_ARCHIVE_BYTES:
+            expected = f"maps of at most {MAX_MAP_VALUES} values in {MAX_ARCHIVE_BYTES} bytes"
+            raise invalid("--out", expected, f"{n_values} values in {len(content)} bytes")
+        files["maps"] = flags.out.with_suffix(".npz"), lambda file: file.write(content)
+    if no_fly is not None:
+        # Cells without a value are free, because rasters made from polygons have none outside them.
+        cells = np.nan_to_num(no_fly.values, nan=0.0) != 0.0
+        if cells.all():
+            raise invalid(no_fly.name, "a cell of 0, where robots may be", "none")
+        files["no_fly"] = flags.out.with_suffix(".no_fly.npy"), lambda file: np.save(file, cells)
+    for file, _ in files.values():
+        check_new("--out", file, force=flags.force)
+    return files
 
 
 def _no_fly_summary(layer: Layer) -> str:
@@ -289,44 +277,41 @@ def _layer(file: Path, choice: Choice) -> Layer:
     return layer
 
 
-def _whole(layer: Layer, missing_zone: int | None) -> NDArray[np.int64]:
+def _whole(layer: Layer, missing_class: int | None) -> NDArray[np.int64]:
     missing = np.isnan(layer.values)
-    if missing.any() and missing_zone is None:
+    if missing.any() and missing_class is None:
         row, column = np.argwhere(missing)[0].tolist()
         got = f"none in {missing.sum()} cells, the first in row {row}, column {column}"
-        remedy = "--missing-zone N gives them the number N"
+        remedy = "--missing-class N gives them the class N"
         raise invalid(layer.name, "a number in each cell", f"{got}; {remedy}")
-    values = np.where(missing, missing_zone or 0, layer.values)
+    values = np.where(missing, missing_class or 0, layer.values)
     wrong = values[(values % 1 != 0) | (np.abs(values) > _MOST_NUMBER)]
     if wrong.size:
-        raise invalid(layer.name, "whole numbers, each a zone", wrong[0])
+        raise invalid(layer.name, "whole numbers, each a class of fuel", wrong[0])
     return values.astype(np.int64)
-
-
-def _map(
-    key: str, cells: NDArray[np.uint8], flags: argparse.Namespace, contents: dict[Path, Fill]
-) -> list[list[int]] | str:
-    """Returns the value of a map in the model file: its rows, or the name of a file if it is large.
-
-    Adds that file to `contents`.
-    """
-    if cells.size <= _MOST_INLINE:
-        return cells.tolist()
-    file = flags.out.with_suffix(f".{key}.npy")
-    check_new("--out", file, force=flags.force)
-    contents[file] = lambda opened: np.save(opened, cells)
-    return utf8("--out", file.name)
 
 
 def _origin(flags: argparse.Namespace, layers: dict[str, Layer]) -> str:
     """Returns a comment that names the sources of the file."""
     files = ", ".join(ascii(getattr(flags, key).name) for key in layers)
     wind = f"{flags.wind_speed:g} m/s towards {flags.wind_towards:g} degrees"
-    return f"{_NAME}: {files}; model {ascii(flags.model)}; wind of {wind}"
+    return f"{_NAME}: {files}; wind of {wind}"
 
 
-def _values(text: str) -> tuple[int, ...]:
+def _classes(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected whole numbers, got {text}") from None
+
+
+def _factors(text: str) -> dict[int, float]:
+    try:
+        pairs = [part.split("=") for part in text.split(",")]
+        table = {int(one): float(factor) for one, factor in pairs}
+    except ValueError:
+        table = {0: -1.0}
+    if not all(0.0 <= factor <= _MOST_FACTOR for factor in table.values()):
+        expected = f"classes with factors of 0 to {_MOST_FACTOR:g}, such as 1=0.5,2=3"
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text}")
+    return table

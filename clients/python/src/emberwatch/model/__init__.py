@@ -5,6 +5,7 @@ observation matrix ``O`` of eq. 1. The native module checks files, and this modu
 ones. `emberwatch.belief` applies the parameters to a belief.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
 from typing import Any, Self
@@ -16,7 +17,7 @@ import emberwatch._native as _native
 from emberwatch.common.arguments import as_count
 from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
 from emberwatch.errors import invalid
-from emberwatch.model.airspace import Airspace, Zones
+from emberwatch.model.airspace import Airspace
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255 each."""
@@ -100,7 +101,7 @@ class Description:
 
     def _values(self) -> list[object]:
         values = [getattr(self, field.name) for field in fields(self) if field.name != "toml"]
-        return [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
+        return [_plain(value) for value in values]
 
     @staticmethod
     def _read(text: str) -> dict[str, Any]:
@@ -112,31 +113,42 @@ class Description:
         return _native.description_with_radius(text, radius)
 
 
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """A transition of a model file: a way in which a cell changes from one state to another."""
+
+    from_: str
+    """The cell's state at step k."""
+    to: str
+    """The cell's state at step k + 1."""
+    base: float
+    """Probability without neighbours."""
+    near: Mapping[str, Sequence[Sequence[float]]]
+    """For a neighbour's state, the probability by the neighbour's place; the centre is the cell."""
+    times: Sequence[str]
+    """Names of the maps that multiply the hazards -log(1 - p)."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Model(Description):
     """A hidden Markov model of the world; make one with `named` or `from_toml`.
 
-    (KH, KW) is the size of its kernels; both are odd.
+    It has either a kernel and a bias, of size (KH, KW), both odd, or transitions.
     """
 
-    kernels: NDArray[np.float64]
-    """The weights ``w[next state, state of the neighbour, row, col]`` of eq. 2. The centre is the
-    cell itself; rows grow downward. A model has one kernel for all cells, shape (1, S, S, KH, KW),
-    or one for each state of the cell itself, shape (S, S, S, KH, KW). With zones, each
-    zone has its own kernels, stored one zone after another: shape (n_zones, S, S, KH, KW), or
-    (n_zones * S, S, S, KH, KW) with one for each state of the cell itself."""
-    bias: NDArray[np.float64]
+    kernel: NDArray[np.float64] | None
+    """The weights ``w[next state, state of the neighbour, row, col]`` of eq. 2, shape
+    (S, S, KH, KW). The centre is the cell itself; rows grow downward."""
+    bias: NDArray[np.float64] | None
     """``b`` of eq. 2, which is added to each next state's weight, shape (S,)."""
     initial: NDArray[np.float64]
     """Distribution of a cell's state at the start of the burn-in, shape (S,)."""
     edge: int | None
     """State of all cells outside the grid (``edge`` in the file); None: these add no weight."""
-    zone_names: tuple[str, ...]
-    """Names of the zones of land; empty if the model has no zones."""
-    zone_colors: tuple[Color, ...]
-    """One colour for each zone."""
-    zone_map: NDArray[np.uint8] | None
-    """The zone of each cell, shape (H, W); None if the model has no zones."""
+    transitions: tuple[Transition, ...]
+    """The transitions; those of each state are tried in order."""
+    maps: Mapping[str, NDArray[np.float32]]
+    """The factors that transitions name, shape (H, W) or (KH, KW, H, W). They are read-only."""
 
     @classmethod
     def named(cls, model: "Model | str | PathLike[str]") -> "Model":
@@ -156,31 +168,24 @@ class Model(Description):
         """Returns the built-in model `wildfire`, from section II of the paper."""
         return cls.from_toml(_native.built_in("models")["wildfire"])
 
-    @property
-    def zones(self) -> Zones | None:
-        """The zones of land; None if the model has no zones."""
-        if self.zone_map is None:
-            return None
-        colors = tuple("#{:02x}{:02x}{:02x}".format(*color) for color in self.zone_colors)
-        return Zones(names=self.zone_names, colors=colors, map=self.zone_map)
-
-    @property
-    def kernel(self) -> NDArray[np.float64]:
-        """The first kernel: the only one, unless the model has zones or `sees_own_state`."""
-        return self.kernels[0]
-
-    @property
-    def sees_own_state(self) -> bool:
-        """Whether a cell's weights depend on its own state."""
-        return len(self.kernels) > max(1, len(self.zone_names))
-
     @staticmethod
     def _read(text: str) -> dict[str, Any]:
-        return _native.read_model(text)
+        values = _native.read_model(text)
+        values["transitions"] = tuple(Transition(*it) for it in values["transitions"])
+        for factors in values["maps"].values():
+            factors.flags.writeable = False
+        return values
 
     @staticmethod
     def _with_radius(text: str, radius: int) -> str:
         return _native.model_with_radius(text, radius)
+
+
+def _plain(value: Any) -> Any:
+    """Converts arrays, and the arrays of a mapping, to lists, which can be compared."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return {key: _plain(it) for key, it in value.items()} if isinstance(value, dict) else value
 
 
 def color_from_hex(text: str) -> Color:
