@@ -3,6 +3,7 @@
 use super::messages::Seed;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_learning::beliefs::LEARNED;
 use emberwatch_learning::beliefs::autoencoder::Follower;
 use emberwatch_learning::beliefs::learned::LearnedModel;
@@ -18,7 +19,7 @@ use emberwatch_learning::policy::LearnedDecisions;
 use emberwatch_learning::reward::RewardEstimate;
 use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
 use emberwatch_protocol::model::ModelFile;
-use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Move, Shape, Transition};
+use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Move, Shape};
 use ndarray::{Array3, Axis};
 use std::collections::BTreeMap;
 
@@ -184,7 +185,7 @@ fn decisions() -> Contents {
 }
 
 fn base_of_filter() -> Base {
-    let fit = FilterFit::new(dimensions(false), worlds().shape(), &config());
+    let fit = FilterFit::new(dimensions(), worlds().shape(), &config());
     let mut learned = Learned::default();
     learned.put(fit.learned());
     Base::new(&LEARNED, None, learned, worlds().shape()).expect("learned")
@@ -198,8 +199,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
     let encoded = |kind, contents: Contents| encode(kind, &contents).expect("they serialise");
     // The large autoencoder claims a size of 30 GiB, but no decoder may allocate so much.
     [
-        ("filter", "learned_filter", filter(dimensions(false))),
-        ("own_filter", "learned_filter", filter(dimensions(true))),
+        ("filter", "learned_filter", filter(dimensions())),
         ("autoencoder", "autoencoder", autoencoder(8, 4)),
         ("autoencoder_large", "autoencoder", autoencoder(4096, 256)),
         ("decisions", "decisions", decisions()),
