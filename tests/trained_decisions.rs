@@ -3,7 +3,6 @@
 
 use crate::commands::{agent, check};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
-use emberwatch_learning::config::{AgentConfig, KernelKind};
 use emberwatch_learning::learners::decisions::SavedDecisions;
 use tests::harness::{AGENT, SMALL, Server, repository};
 
@@ -37,12 +36,10 @@ fn steps(place: &Place, out: &str) -> String {
     row[1].clone()
 }
 
-/// Returns the kind of kernels and the estimator in a checkpoint.
-fn saved(place: &Place, out: &str) -> (KernelKind, String) {
-    let contents = place.contents(out);
-    let settings: AgentConfig = contents.settings().expect("its settings");
-    let state: SavedDecisions = contents.state().expect("its state");
-    (settings.kernels, state.estimator)
+/// Returns the name of the estimator of saved decisions.
+fn saved(place: &Place, out: &str) -> String {
+    let state: SavedDecisions = place.contents(out).state().expect("its state");
+    state.estimator
 }
 
 #[test]
@@ -95,7 +92,7 @@ fn decisions_are_learned_and_enter_the_ladder_beside_their_filter() {
 #[test]
 fn a_training_that_ended_in_its_filter_resumes_there() {
     let place = place();
-    let first = format!("{WORLDS} --estimator learned+spatial --kernels own");
+    let first = format!("{WORLDS} --estimator learned+spatial");
     let words = "the time ended before the belief was learned: continue with --resume";
     place.refuse("out", &format!("{first} --time-limit 0"), words);
     assert!(!place.checkpoint("out").exists());
@@ -110,14 +107,13 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
         ),
     );
     place.train("out", &format!("{resume} --time-limit 1e19"));
-    let expected = (KernelKind::Own, "learned+spatial".to_owned());
-    assert_eq!(saved(&place, "out"), expected);
+    assert_eq!(saved(&place, "out"), "learned+spatial");
     // The checkpoint now contains decisions, from which a training can resume.
     let filter = place.flag("out/belief");
     let model = repository().join("config/models/wildfire-small.toml");
     let model = std::fs::read_to_string(model).expect("a model");
-    let smoke = "[[observations]]\nname = \"smoke\"\ncolor = \"#808080\"\n\n[[kernel]]";
-    let model = model.replacen("[[kernel]]", smoke, 1);
+    let smoke = "observations = [\n{ name = \"smoke\", color = \"#808080\" },";
+    let model = model.replacen("observations = [", smoke, 1);
     let model = model.replace("observed_as = [0.", "observed_as = [0.1, 0.");
     let model = model.replace("0.98", "0.88").replace("0.80", "0.70");
     let model = format!("--model {}", place.folder.write("smoke.toml", model));
@@ -161,7 +157,7 @@ fn decisions_on_a_known_model_go_on_with_it() {
         place.train(out, &format!("{WORLDS} --resume --steps 10"));
     }
     assert_eq!(steps(&place, "out"), "30");
-    assert_eq!(saved(&place, "out").1, "known");
+    assert_eq!(saved(&place, "out"), "known");
     let is_same = place.bytes("out") == place.bytes("same");
     assert!(is_same, "checkpoints of the same training differ");
 }

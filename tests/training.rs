@@ -235,9 +235,9 @@ fn signals_and_a_dead_server_end_training_with_a_checkpoint() {
 fn a_checkpoint_is_compared_and_checked() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
-    place.train("own", &format!("{WORLDS} --steps 80 --kernels own"));
-    let compared = place.compare("own", "");
-    let (out, own) = (place.flag("out"), place.flag("own"));
+    place.train("other", &format!("{WORLDS} --steps 80"));
+    let compared = place.compare("other", "");
+    let (out, other) = (place.flag("out"), place.flag("other"));
     for policy in [
         "learned/shooting/exploit",
         "learned_beam",
@@ -245,7 +245,7 @@ fn a_checkpoint_is_compared_and_checked() {
     ] {
         compared.check_prints(policy);
     }
-    let both = format!("compare {out} {own} {COMPARED}");
+    let both = format!("compare {out} {other} {COMPARED}");
     check(
         AGENT,
         &both,
@@ -256,26 +256,11 @@ fn a_checkpoint_is_compared_and_checked() {
         "run {} --steps 5 --policy learned+spatial/beam/exploit",
         on(&server)
     );
-    agent(&format!("{run} {own}"));
+    agent(&format!("{run} {other}"));
     let words = "learned_spatial_beam | needs --checkpoint FILE: expected a checkpoint of `train --learner filter`";
     check(AGENT, &run, words);
     let resume = format!("{WORLDS} --steps 8 --resume");
-    let other = format!("{resume} --kernels neighbours");
-    let words = "--kernels: expected own as in the checkpoint, got neighbours";
-    place.refuse("own", &other, words);
-    place.train("own", &resume);
-    for learner in [
-        "neural",
-        "decisions --estimator known",
-        "decisions --resume",
-    ] {
-        let flags = format!("{WORLDS} --learner {learner} --kernels own");
-        place.refuse(
-            "new",
-            &flags,
-            "--kernels applies only where a filter is trained",
-        );
-    }
+    place.train("other", &resume);
     place.set(&SETTINGS.replace("[learning]", "[learning]\nkernel = [5, 5]"));
     let shape = "checkpoint.safetensors: kernel: expected shape [3, 3, 5, 5], got [3, 3, 3, 3]";
     place.refuse("out", &resume, shape);

@@ -22,6 +22,7 @@ import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,46 +37,42 @@ BURNS_ON = float(np.exp(-0.1))
 Fire = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # states and frames, both [K, 25, 25]
 
 
-def model() -> Model:
-    """Returns the fire's model.
+MODEL = f"""
+name = "forest"
+edge = "healthy"
+maps = "forest.npz"
+states = [
+    {{ name = "healthy", color = "#2e8b57", initial = 0.9744, observed_as = [0.9, 0.05, 0.05] }},
+    {{ name = "burning", color = "#c8371b", initial = 0.0256, reward = 1.0, observed_as = [0.05, 0.9, 0.05] }},
+    {{ name = "burnt", color = "#4a4a4a", initial = 0.0, observed_as = [0.05, 0.05, 0.9] }},
+]
+observations = [
+    {{ name = "healthy", color = "#2e8b57" }},
+    {{ name = "burning", color = "#c8371b" }},
+    {{ name = "burnt", color = "#4a4a4a" }},
+]
 
-    The weights give P(ignite) = f / (A f + B), which is exact for f = 1 and f = 4, and off by at
-    most .015 for f = 2 and f = 3. Trees outside the grid are healthy. Each column is a zone of its
-    own, as a differs between columns.
-    """
-    zones, kernels = [], []
-    for column, rate in enumerate(RATES.tolist()):
-        one, four = rate, 1.0 - (1.0 - rate) ** 4
-        slope = (4.0 / four - 1.0 / one) / 3.0
-        rest = 1.0 / one - slope - 4.0 * (1.0 - slope)
-        zones.append(f'[[zones]]\nname = "{column}"\ncolor = "#b7a57a"\n')
-        for own, start, to, near, centre in [
-            ("healthy", "burning", "burning", 1.0, 0.0),
-            ("healthy", "healthy", "healthy", 1.0 - slope, rest),
-            ("healthy", "burnt", "healthy", 1.0 - slope, 0.0),
-            ("burning", "burning", "burning", 0.0, BURNS_ON),
-            ("burning", "burning", "burnt", 0.0, 1.0 - BURNS_ON),
-            ("burnt", "burnt", "burnt", 0.0, 1.0),
-        ]:
-            weights = [[0.0, near, 0.0], [near, centre, near], [0.0, near, 0.0]]
-            kernels.append(
-                f'[[kernel]]\nzone = "{column}"\nown = "{own}"\nfrom = "{start}"\nto = "{to}"\n'
-                f"weights = {weights}\n"
-            )
-    states = [
-        ("healthy", "#2e8b57", 609 / 625, [0.9, 0.05, 0.05]),
-        ("burning", "#c8371b", 16 / 625, [0.05, 0.9, 0.05]),
-        ("burnt", "#4a4a4a", 0.0, [0.05, 0.05, 0.9]),
-    ]
-    tables = [
-        f'[[states]]\nname = "{name}"\ncolor = "{color}"\ninitial = {initial}\n'
-        f"reward = {float(name == 'burning')}\nobserved_as = {seen}\n"
-        f'[[observations]]\nname = "{name}"\ncolor = "{color}"\n'
-        for name, color, initial, seen in states
-    ]
-    zone_map = [list(range(SIDE))] * SIDE
-    top = f'name = "forest"\nkernel_size = [3, 3]\nedge = "healthy"\nzone_map = {zone_map}\n'
-    return Model.from_toml("\n".join([top, *tables, *zones, *kernels]))
+[[transitions]]
+from = "healthy"
+to = "burning"
+near.burning = [[0.0, 0.1, 0.0], [0.1, 0.0, 0.1], [0.0, 0.1, 0.0]]
+times = ["rate"]
+
+[[transitions]]
+from = "burning"
+to = "burnt"
+base = {1.0 - BURNS_ON}
+"""
+
+
+def model() -> Model:
+    """Returns the fire's model: exactly the rule above, with a map of the rates."""
+    rate = np.tile(np.log1p(-RATES) / np.log1p(-0.1), (SIDE, 1))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "forest.toml"
+        path.write_text(MODEL)
+        np.savez(path.with_name("forest.npz"), rate=rate)
+        return Model.from_file(path)
 
 
 def burn(random: np.random.Generator) -> NDArray[np.uint8]:

@@ -1,6 +1,6 @@
 """Recorded episodes of `WildfireObjective-v1`, which were planned by a separate process.
 
-`data/options.npz` contains the episodes, and the checkpoints of the learned beliefs: two filters
+`data/options.npz` contains the episodes, and the checkpoints of the learned beliefs: a filter
 and a network, trained for 80 steps in these worlds. The network's weights are rounded to 16 bits.
 """
 
@@ -34,7 +34,6 @@ BELIEFS: dict[str, dict[str, Any]] = {
         "checkpoint": "learned_filter",
         "estimator": "learned+spatial",
     },
-    "learned, own kernels": {"checkpoint": "own_kernels"},
     "neural": {"checkpoint": "neural_belief"},
 }
 

@@ -34,7 +34,6 @@ LEARNED = [name for name in belief.kinds() if name.startswith("learned")]
 CASES: list[tuple[str, str | None]] = [
     *((kind, None) for kind in KNOWN),
     *((kind, "learned_filter") for kind in LEARNED),
-    ("learned", "own_kernels"),
     ("neural", "neural_belief"),
 ]
 
@@ -43,7 +42,7 @@ CASES: list[tuple[str, str | None]] = [
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("checkpoints")
     golden = np.load(golden_options.FILE)
-    for name in ("learned_filter", "own_kernels", "neural_belief"):
+    for name in ("learned_filter", "neural_belief"):
         (folder / name).write_bytes(golden[f"checkpoint {name}"].tobytes())
     return folder
 

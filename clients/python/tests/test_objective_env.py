@@ -104,7 +104,7 @@ def trained(folder: Path, **world: object) -> Path:
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("checkpoints")
-    for name in ("learned_filter", "own_kernels", "neural_belief"):
+    for name in ("learned_filter", "neural_belief"):
         (folder / name).write_bytes(GOLDEN[f"checkpoint {name}"].tobytes())
     return folder
 

@@ -43,7 +43,7 @@ def known(
             (S, H, W), from `initial_prior` or `prior.simulated_prior` for example. It is stored in
             single precision.
         kind: A kind of `kinds` whose name starts with ``"known"``. The plain ``"known"`` is the
-            paper's Bayes filter. With `+second-order` or `+cavities`, it predicts more accurately.
+            paper's Bayes filter. With `+cavities`, it predicts models of hazards more accurately.
             With `+spatial`, a frame also corrects the neighbours of the observed cells.
         n_worlds: Number of worlds, at least 1. None: a single world, and arrays without an axis
             for worlds.

@@ -59,13 +59,10 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
       as many burning cells as estimators with a known model.
         * `"known"`: the Bayes filter with the true model
         * `"known+spatial"`: known, where observations also correct neighbouring cells
-        * `"known+second-order"`: known, with a second-order mean of the ratio in eq. 3
         * `"known+cavities"`: known, predicting a cell without its own influence on its neighbours
         * `"known+spatial+cavities"`: known+spatial, predicting like known+cavities
         * `"learned"`: a Bayes filter with learned parameters
         * `"learned+spatial"`: learned, where observations also correct neighbouring cells
-        * `"learned+cavities"`: learned, predicting like known+cavities
-        * `"learned+spatial+cavities"`: learned+spatial, predicting like known+cavities
         * `"neural"`: a learned network that predicts observations from the last ones
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; its

@@ -16,13 +16,10 @@ from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, re
 Estimator: TypeAlias = Literal[
     "known",
     "known+spatial",
-    "known+second-order",
     "known+cavities",
     "known+spatial+cavities",
     "learned",
     "learned+spatial",
-    "learned+cavities",
-    "learned+spatial+cavities",
     "neural",
 ]
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
