@@ -20,12 +20,3 @@ def bearing(text: str) -> float | None:
         return float(text)
     except ValueError:
         return None
-
-
-def facing(eighths: int) -> str:
-    """Returns the aspect of a slope: the compass point that it faces, downhill.
-
-    `eighths`: the direction in which the slope rises, in eighths of a circle from the east towards
-    the north.
-    """
-    return POINTS[(12 - 2 * eighths) % len(POINTS)]
