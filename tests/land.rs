@@ -1,11 +1,14 @@
-//! Tests of zones, no-fly cells and a wide sensor on a running server. The expected observations and rewards are
+//! Tests of maps, no-fly cells and a wide sensor on a running server. The expected observations and rewards are
 //! derived only from the paths, the hidden states and the reply to `hello`.
 
 use crate::commands::{agent, check};
 use crate::trainings::on;
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::{Client, Model, UNOBSERVED};
+use ndarray::Array2;
+use ndarray_npy::NpzWriter;
 use std::collections::BTreeSet;
+use std::io::Cursor;
 use tests::harness::{Folder, PATIENCE, Paths, SERVER, Server, reset, run};
 
 const N_MOVES: usize = 6;
@@ -16,29 +19,22 @@ fn map(value: impl Fn(usize, usize) -> usize) -> String {
     format!("{:?}", Vec::from_iter((0..7).map(row)))
 }
 
-/// Writes a model with three zones, a sensor radius and a wall of no-fly cells with a gap.
+/// Writes a model with a map of fuel, a sensor radius and a wall of no-fly cells with a gap.
 fn write_model(folder: &Folder, radius: usize) -> String {
-    let wildfire = Model::built_in("wildfire-small").expect("built in");
-    let mut file = wildfire.file().clone();
-    let kernel = std::mem::take(&mut file.kernel);
+    let burnout = Model::built_in("wildfire-burnout").expect("built in");
+    let mut file = burnout.file().clone();
     file.name = "land".into();
-    let rest = toml::to_string(&file)
-        .expect("TOML")
-        .replace("kernel = []\n", "");
-    let zones = map(|row, col| (row + col) % 3);
+    file.transitions[0].base = 0.02;
+    file.transitions[0].times = vec!["fuel".into()];
+    let fuel = Array2::from_shape_fn((7, 9), |(row, col)| (row * col % 3) as f32);
+    let mut archive = NpzWriter::new(Cursor::new(Vec::new()));
+    archive.add_array("fuel", &fuel).expect("an array");
+    let archive = archive.finish().expect("an archive");
+    std::fs::write(folder.path("land.npz"), archive.into_inner()).expect("a file");
+    let rest = toml::to_string(&file).expect("TOML");
     let wall = map(|row, col| usize::from(col == 4 && row != 3));
-    let mut text =
-        format!("zone_map = {zones}\nno_fly = {wall}\n{rest}\n[sensor]\nradius = {radius}\n");
-    for zone in 0..3 {
-        text += &format!("[[zones]]\nname = \"z{zone}\"\ncolor = \"#80{zone}{zone}80\"\n");
-        for entry in &kernel {
-            let scale = entry.scale * f64::from(1 + zone);
-            text += &format!(
-                "[[kernel]]\nzone = \"z{zone}\"\nfrom = {:?}\nto = {:?}\nscale = {scale:?}\nweights = {:?}\n",
-                entry.from, entry.to, entry.weights
-            );
-        }
-    }
+    let text =
+        format!("maps = \"land.npz\"\nno_fly = {wall}\n{rest}\n[sensor]\nradius = {radius}\n");
     folder.write("land.toml", text)
 }
 
@@ -55,14 +51,17 @@ fn robots_see_and_earn_what_hello_and_the_hidden_states_say() {
     let info = server.info();
     let airspace = info.airspace().expect("an airspace");
     assert_eq!((airspace.radius(), info.n_observations), (2, 3));
-    assert_eq!(info.zones.map(|zones| zones.names.len()), Some(3));
+    let model = info.model.as_ref().expect("a model");
+    let model = Model::from_toml(model).expect("a model with its map");
+    let hazards = model.hazards().expect("hazards");
+    assert_eq!(hazards.maps()["fuel"].shape(), [7, 9]);
     let truth = Observer::truth(&server.instance).expect("truth");
     let mut client = server.acquire(0..2);
     reset(&mut client, 1000);
     let (mut paths, mut total) = (Paths::new(3), 0.0);
     // The number of cells observed next to the paths, how many of these were observed correctly, and the expected number.
     let (mut n_seen, mut n_right, mut n_expected) = (0.0_f64, 0.0, 0.0);
-    let likelihood = Model::wildfire().likelihood().clone();
+    let likelihood = model.likelihood();
     for _ in 0..200 {
         let starts = client.observe(0..2).expect("observe");
         let flown = paths.take(N_MOVES, 2);
@@ -92,7 +91,7 @@ fn robots_see_and_earn_what_hello_and_the_hidden_states_say() {
             }
             paying.extend(flight.visited);
         }
-        let burning = paying.iter().filter(|&&cell| states[cell] == 2).count();
+        let burning = paying.iter().filter(|&&cell| states[cell] == 1).count();
         assert_eq!(world.reward, burning as f64);
         total += world.reward;
     }
