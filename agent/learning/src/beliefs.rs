@@ -134,7 +134,7 @@ mod tests {
         }
         for kind in neural {
             refuses(kind, None);
-            refuses(kind, Some(learned_filter(false)));
+            refuses(kind, Some(learned_filter()));
         }
     }
 

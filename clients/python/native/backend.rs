@@ -46,8 +46,8 @@ pub struct CheckedSettings {
     checked: Checked,
 }
 
-/// Name, moves, robots, steps, first and end of the test seeds, and prefix of the environments' ids.
-type TaskFields<'a> = (&'a str, usize, u32, u64, u64, u64, &'a str);
+/// Name, moves, robots, steps, first and end of the test seeds, and prefix and version of the environments' ids.
+type TaskFields<'a> = (&'a str, usize, u32, u64, u64, u64, &'a str, u32);
 
 /// A call that makes a copy: the function and its arguments.
 type Copying<'a, 'py> = (Bound<'py, PyAny>, (&'a str, u32, String));
@@ -92,10 +92,11 @@ impl CheckedSettings {
     #[getter]
     fn task(&self) -> Option<TaskFields<'_>> {
         let task = self.checked.task.as_ref()?;
-        let ids = task.listing.as_ref().map_or("", |listing| &listing.ids);
+        let listing = task.listing.as_ref();
+        let (ids, version) = listing.map_or(("", 0), |it| (&it.ids, it.version));
         let Range { start, end } = task.test_seeds;
         let (moves, robots, steps) = (task.moves, task.robots, task.max_steps);
-        Some((&task.name, moves, robots, steps, start, end, ids))
+        Some((&task.name, moves, robots, steps, start, end, ids, version))
     }
 
     #[getter]

@@ -145,7 +145,7 @@ def test_a_running_server_must_have_the_task() -> None:
             env.reset(seed=0)
         env.close()
         with refuses("task: expected the server's 'small', or None, got 'sparse'"):
-            gymnasium.make("emberwatch/WildfireSparse-v0", instance=lab)
+            gymnasium.make("emberwatch/WildfireSparse-v1", instance=lab)
         with refuses("task ash: No such file"):
             gymnasium.make(WILDFIRE, instance=lab, task="ash")
 

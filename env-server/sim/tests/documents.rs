@@ -33,22 +33,25 @@ fn every_task_has_its_row() {
             ..ServerConfig::default()
         };
         let shape = config.check().expect(name).shape;
-        let ids = task.listing.expect("a built-in task").ids;
+        let listing = task.listing.expect("a built-in task");
+        let ids = format!("`{}`, v{}", listing.ids, listing.version);
         let (world, seeds) = (task.model + &task.states, task.test_seeds);
         let (first, last) = (seeds.start, seeds.end - 1);
         let (moves, steps) = (task.moves, task.max_steps);
         format!(
-            "| `{name}` | `{ids}` | `{world}` | {shape} | {moves} | {steps} | {first} to {last} |"
+            "| `{name}` | {ids} | `{world}` | {shape} | {moves} | {steps} | {first} to {last} |"
         )
     });
     // Removes what is only in the documents: words after the model or the states in the third column, and "up to" in
     // the sixth column of recorded worlds.
-    let documented = rows("| task | ids begin with |").into_iter().map(|row| {
-        let mut cells: Vec<&str> = row.split(" | ").collect();
-        let world = cells[2].split_inclusive('`').take(2).collect::<String>();
-        cells[2] = &world;
-        cells.join(" | ").replace("up to ", "")
-    });
+    let documented = rows("| task | ids begin with, version |")
+        .into_iter()
+        .map(|row| {
+            let mut cells: Vec<&str> = row.split(" | ").collect();
+            let world = cells[2].split_inclusive('`').take(2).collect::<String>();
+            cells[2] = &world;
+            cells.join(" | ").replace("up to ", "")
+        });
     let (documented, known): (Vec<_>, Vec<_>) = (documented.collect(), known.collect());
     assert_eq!(
         documented.join("\n"),

@@ -74,6 +74,9 @@ pub struct Listing {
     pub place: u32,
     /// Prefix of the ids of the task's Python environments.
     pub ids: String,
+    /// Version of the task's worlds. It rises when their settings change, and ends the ids.
+    #[serde(default)]
+    pub version: u32,
 }
 
 /// The robots' cells after a reset.

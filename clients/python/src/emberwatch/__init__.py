@@ -81,13 +81,13 @@ __version__ = VERSION
 
 def _register(task: Task, /, **keywords: Any) -> None:
     """Registers the three environments of a task, with `keywords` as defaults."""
-    for module, kind, version, steps in (
+    for module, kind, first, steps in (
         ("path_env", "", 0, task.max_steps),
         ("moves_env", "Moves", 0, task.n_moves * task.max_steps),
         ("objective_env", "Objective", 1, task.max_steps),
     ):
         gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-            f"emberwatch/{task.ids}{kind}-v{version}",
+            f"emberwatch/{task.ids}{kind}-v{first + task.version}",
             entry_point=f"emberwatch.envs.{module}:Wildfire{kind}Env",
             vector_entry_point=f"emberwatch.envs.{module}:Wildfire{kind}VectorEnv",
             max_episode_steps=steps,

@@ -100,8 +100,8 @@ class CheckedSettings:
         """Text of the model file with all maps, or of the description of recorded states."""
 
     @property
-    def task(self) -> tuple[str, int, int, int, int, int, str] | None:
-        """Name, moves, robots, steps, first and end of the test seeds, and prefix of ids."""
+    def task(self) -> tuple[str, int, int, int, int, int, str, int] | None:
+        """Name, moves, robots, steps, first and end of the test seeds, prefix and version of ids."""
 
     @property
     def worlds_fingerprint(self) -> str:

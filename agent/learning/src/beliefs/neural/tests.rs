@@ -102,7 +102,7 @@ fn equal_models_have_equal_targets_filters_and_parameters() {
         filter: filter.map(Box::new),
         target,
     };
-    let learned = || Some(learned_filter(false));
+    let learned = || Some(learned_filter());
     let first = model(1, learned(), 1);
     assert_eq!(first, model(1, learned(), 1));
     for other in [

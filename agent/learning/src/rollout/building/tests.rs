@@ -81,7 +81,7 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
 #[test]
 fn every_policy_plans_on_the_configured_belief() {
     let mut learned = Learned::default();
-    learned.put(learned_filter(true));
+    learned.put(learned_filter());
     learned.put(network(BasisKind::Predictor, |_| true));
     learned.put(NeuralModel {
         network: NeuralBelief::new(3, 1, &Device::Cpu).expect("a network"),

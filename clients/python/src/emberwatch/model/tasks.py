@@ -23,6 +23,8 @@ class Task:
     #: Prefix of the ids of its environments, such as `WildfireSmall` in
     #: `emberwatch/WildfireSmall-v0`; empty if it has no environments.
     ids: str = field(default="", compare=False)
+    #: Version of its worlds, with which these ids end. It rises when the worlds change.
+    version: int = field(default=0, compare=False)
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
@@ -36,7 +38,7 @@ class Task:
         """Returns the task of settings; None if they have no task."""
         if settings.task is None:
             return None
-        name, n_moves, robots, max_steps, start, end, ids = settings.task
+        name, n_moves, robots, max_steps, start, end, ids, version = settings.task
         return cls(
             name=name,
             n_moves=n_moves,
@@ -44,6 +46,7 @@ class Task:
             max_steps=max_steps,
             test_seeds=range(start, end),
             ids=ids,
+            version=version,
         )
 
 
