@@ -75,12 +75,12 @@ fn documented_and_checked_settings_are_accepted_as_files() {
 fn worlds_in_which_nothing_pays_or_burns_are_warned_of_once() {
     let folder = Folder::default();
     let wildfire = include_str!("../config/models/wildfire.toml");
-    assert!(wildfire.contains("reward = 1.0"));
+    assert!(wildfire.contains("reward = 1.0, "));
     let pays = folder.write(
         "pays.toml",
         wildfire.replace("reward = 1.0", "reward = -1.0"),
     );
-    let free = folder.write("free.toml", wildfire.replace("reward = 1.0", ""));
+    let free = folder.write("free.toml", wildfire.replace("reward = 1.0, ", ""));
     let none_burns = "no cell is in the state with the highest reward";
     let lively = "--worlds 3 --model wildfire-small --height 16 --width 16 --burn-in";
     for (flags, words, n_warnings) in [

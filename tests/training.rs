@@ -235,7 +235,7 @@ fn signals_and_a_dead_server_end_training_with_a_checkpoint() {
 fn a_checkpoint_is_compared_and_checked() {
     let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
-    place.train("other", &format!("{WORLDS} --steps 80"));
+    place.train("other", &format!("{WORLDS} --steps 88"));
     let compared = place.compare("other", "");
     let (out, other) = (place.flag("out"), place.flag("other"));
     for policy in [

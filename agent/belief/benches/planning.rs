@@ -122,5 +122,27 @@ fn estimators(c: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, planners, teams, estimators);
+/// The prediction by hazards, without and with cavities.
+fn predictions(c: &mut Criterion) {
+    for name in [
+        "wildfire-burnout",
+        "wildfire-terrain",
+        "wildfire-sparse",
+        "crop-disease",
+    ] {
+        let model = Model::built_in(name).expect("bench model");
+        for (cavities, suffix) in [(false, ""), (true, ", with cavities")] {
+            if cavities && name == "crop-disease" {
+                continue;
+            }
+            let prior = Belief::from_initial(&model, shape());
+            let mut filter = BayesFilter::known(&model, prior, cavities).expect("valid model");
+            c.bench_function(&format!("prediction of {name}{suffix}"), |b| {
+                b.iter(|| filter.predict());
+            });
+        }
+    }
+}
+
+criterion_group!(benches, planners, teams, estimators, predictions);
 criterion_main!(benches);

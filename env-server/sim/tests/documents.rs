@@ -34,7 +34,7 @@ fn every_task_has_its_row() {
         };
         let shape = config.check().expect(name).shape;
         let listing = task.listing.expect("a built-in task");
-        let ids = format!("`{}`, v{}", listing.ids, listing.version);
+        let ids = format!("`{}` v{}", listing.ids, listing.version);
         let (world, seeds) = (task.model + &task.states, task.test_seeds);
         let (first, last) = (seeds.start, seeds.end - 1);
         let (moves, steps) = (task.moves, task.max_steps);

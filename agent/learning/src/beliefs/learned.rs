@@ -149,7 +149,7 @@ pub fn checked(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensions> {
         n_axes == 4 && part.shape("zones").is_none(),
         "kernel",
         "the same weights in every cell",
-        "kernels by own state or zone, which earlier releases learned: train the filter again",
+        "kernels by own state or zone: train the filter again",
     )?;
     let checked = dimensions.check();
     checked.map_err(|error| wrong("dimensions", "valid dimensions of a filter", error))

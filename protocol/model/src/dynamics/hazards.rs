@@ -13,12 +13,11 @@
 use super::super::grid::{Cell, Shape};
 use super::super::hazards::{Factors, Hazards, Transition, hazard, scaled};
 use super::super::randomness::split_mix;
+use super::buffers::{Buffers, Keys};
 use super::kernel::uniform;
 use super::lanes::{LANES, fill, lanes_from};
 use super::places::Places;
-use super::{Buffers, Keys};
 use std::collections::BTreeMap;
-use std::ops::Range;
 
 /// Number of units of a hazard of 1.
 const UNIT: f64 = (1_u64 << 40) as f64;
@@ -101,13 +100,8 @@ impl Tables {
 
     /// Writes the next states of the cells in all bands.
     #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
-    pub(super) fn advance(
-        &self,
-        keys: Keys,
-        bands: impl Iterator<Item = Range<usize>>,
-        buffers: &mut Buffers,
-    ) {
-        for band in bands {
+    pub(super) fn advance(&self, keys: Keys, buffers: &mut Buffers) {
+        for band in buffers.bands() {
             let Places { states, next, .. } = &mut buffers.places;
             let bytes = &mut next[band.clone()];
             fill(bytes, keys[0], band.start / 8);

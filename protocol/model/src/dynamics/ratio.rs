@@ -14,14 +14,13 @@
 
 use super::super::file::MAX_VALUES;
 use super::super::parameters::Ratio;
+use super::buffers::{Buffers, Keys};
 use super::bytes::Bytes;
 use super::kernel::{Kernel, invert, uniform};
 use super::lanes::Words;
 use super::mixture::Mixture;
 use super::parents::Parents;
 use super::places::{OFF_GRID, Places};
-use super::{Buffers, Keys};
-use std::ops::Range;
 
 /// The tables computed from the parameters and the grid, which all worlds share.
 #[derive(Debug)]
@@ -55,14 +54,9 @@ impl Tables {
 
     /// Writes the next states of the cells in all bands.
     #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
-    pub(super) fn advance(
-        &self,
-        [byte_key, draw_key]: Keys,
-        bands: impl Iterator<Item = Range<usize>>,
-        buffers: &mut Buffers,
-    ) {
+    pub(super) fn advance(&self, [byte_key, draw_key]: Keys, buffers: &mut Buffers) {
         let mut words = Words::new(draw_key);
-        for band in bands {
+        for band in buffers.bands() {
             self.bytes
                 .decide(&mut buffers.places, band.clone(), byte_key);
             let mut n_undecided = buffers.list_marked(band);

@@ -317,8 +317,7 @@ mod tests {
                     .tensors
                     .insert("zones".into(), Tensor { shape, numbers });
             },
-            "kernel: expected the same weights in every cell, got kernels by own state or zone, which earlier releases \
-             learned: train the filter again",
+            "kernel: expected the same weights in every cell, got kernels by own state or zone: train the filter again",
         );
         forged(
             |contents, _| drop(contents.tensors.remove("initial.first_moment")),
