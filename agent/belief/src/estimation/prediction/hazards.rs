@@ -150,12 +150,13 @@ impl HazardPrediction {
         let expected = self.n_states * self.shape.n_cells();
         assert_eq!(belief.len(), expected, "belief: expected [S, H, W]");
         self.beliefs.set_belief(belief);
+        let changes = Arc::clone(&self.changes);
         vectorised(
             #[inline(always)]
             || {
                 for row in 0..self.shape.height() {
                     for col in (0..self.shape.width()).step_by(LANES) {
-                        self.predict_chunk(self.beliefs.planes.place([row, col]));
+                        self.predict_chunk(&changes, self.beliefs.planes.place([row, col]));
                         self.store([row, col], belief);
                     }
                 }
@@ -166,7 +167,7 @@ impl HazardPrediction {
 
     /// Computes the next-state distributions of the cells of a chunk that starts at index `place` of a plane.
     #[inline(always)] // So that `vectorised` compiles it for this processor's vector instructions.
-    fn predict_chunk(&mut self, place: usize) {
+    fn predict_chunk(&mut self, changes: &[Vec<Change>], place: usize) {
         let n_cavities = self.beliefs.n_cavities;
         self.work.next.fill([0.0; LANES]);
         self.work.next_cavities.fill([0.0; LANES]);
@@ -178,9 +179,7 @@ impl HazardPrediction {
                 self.work.rest.fill([1.0; LANES]);
                 self.work.last.fill([1.0; LANES]);
             }
-            for index in 0..self.changes[own].len() {
-                let changes = self.changes.clone();
-                let change = &changes[own][index];
+            for change in &changes[own] {
                 if !change.neighbours.is_empty() {
                     product = self.multiply(change, place, has_cavities);
                 }
@@ -231,9 +230,9 @@ impl HazardPrediction {
                 probability.subtract(&mut factor, self.belief(of, *state, at), place);
             }
             // The sum of a belief can exceed 1 by rounding.
-            factor
-                .iter_mut()
-                .for_each(|factor| *factor = factor.max(0.0));
+            for lane in &mut factor {
+                *lane = if *lane < 0.0 { 0.0 } else { *lane };
+            }
             if has_cavities {
                 self.work.rest[*index] = product;
                 self.work.factors[*index] = factor;
