@@ -20,10 +20,7 @@ use super::grid::{Probabilities, Shape};
 use super::vectors::{LANES, vectorised};
 use layout::Layout;
 use ndarray::Array4;
-use rows::{Row, kernel_rows, taps_that_weigh_alike};
-
-/// One value for each cell of a chunk: [`LANES`] consecutive cells of a row.
-type Lanes = [f32; LANES];
+use rows::{Lanes, Row, kernel_rows, taps_that_weigh_alike};
 
 /// The operator `Phi` for one kernel on one grid, with its buffers. Each thread needs its own clone.
 #[derive(Debug, Clone)]

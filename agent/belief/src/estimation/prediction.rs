@@ -26,23 +26,6 @@ enum Kind {
     Hazards(HazardPrediction),
 }
 
-/// Maximum deviation from 1 of a distribution's sum that is left uncorrected.
-const MAX_DRIFT: f32 = 1e-5;
-
-/// Normalises distributions whose rounding errors have added up, as happens in a cell that is never seen.
-///
-/// The planes of two successive states start `plane_length` values apart, and each lane contains one distribution.
-#[inline(always)]
-fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
-    if sums.iter().all(|sum| (sum - 1.0).abs() <= MAX_DRIFT) {
-        return;
-    }
-    for plane in planes.chunks_mut(plane_length) {
-        let lanes = plane.iter_mut().zip(sums);
-        lanes.for_each(|(probability, sum)| *probability /= sum);
-    }
-}
-
 impl Prediction {
     /// Prepares the predictions of a known model on the belief's grid. With `cavities`, a model of hazards is predicted
     /// without the influence of each cell on itself through its neighbours; other models have no cavities.

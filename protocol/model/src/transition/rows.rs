@@ -6,10 +6,12 @@
 //! Why the result is the same: `w x + w y = w (x + y)`. `tests/model/models.rs` computes the formula's sums in double
 //! precision, and `tests/model/transition.rs` compares the results for random models and grids.
 
-use super::Lanes;
 use super::layout::Layout;
 use crate::vectors::LANES;
 use ndarray::{Array4, s};
+
+/// One value for each cell of a chunk: [`LANES`] consecutive cells of a row.
+pub(super) type Lanes = [f32; LANES];
 
 /// Eq. 2 for one next state: its bias, and its weights for groups of taps.
 #[derive(Debug, Clone)]

@@ -15,7 +15,6 @@
 //! cell is predicted from its neighbours' cavities, which do not contain its own influence. If neighbours have an
 //! influence in several current states, only the state with the most influence is treated as susceptible.
 
-use super::correct_drift;
 use super::lanes::{LANES, Lanes, add, add_product, lanes_from, multiply};
 use super::padded::PaddedBeliefs;
 use super::planes::Planes;
@@ -25,6 +24,9 @@ use emberwatch_model::vectors::vectorised;
 use emberwatch_model::{Cell, Shape};
 use std::collections::BTreeMap;
 use std::sync::Arc;
+
+/// Maximum deviation from 1 of a distribution's sum that is left uncorrected.
+const MAX_DRIFT: f32 = 1e-5;
 
 /// The predictions of one world, with its belief and cavities in planes.
 #[derive(Debug, Clone)]
@@ -301,6 +303,20 @@ fn write(next: &[Lanes], planes: &mut [f32], plane_length: usize, n_lanes: usize
         plane[..n_lanes].copy_from_slice(&lanes[..n_lanes]);
     }
     correct_drift(planes, plane_length, &sums[..n_lanes]);
+}
+
+/// Normalises distributions whose rounding errors have added up, as happens in a cell that is never seen.
+///
+/// The planes of two successive states start `plane_length` values apart, and each lane contains one distribution.
+#[inline(always)]
+fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
+    if sums.iter().all(|sum| (sum - 1.0).abs() <= MAX_DRIFT) {
+        return;
+    }
+    for plane in planes.chunks_mut(plane_length) {
+        let lanes = plane.iter_mut().zip(sums);
+        lanes.for_each(|(probability, sum)| *probability /= sum);
+    }
 }
 
 /// Computes `to += here (last - none)`.
