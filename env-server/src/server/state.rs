@@ -7,8 +7,10 @@ use super::ports::{ActiveStep, Ports};
 use super::publications::Publications;
 use super::resets::Resets;
 use anyhow::Result;
+use emberwatch_protocol::Model;
 use emberwatch_protocol::control::Reply;
 use emberwatch_protocol::message::Status;
+use emberwatch_protocol::model::{Ratio, TRANSITIONS_FORM};
 use emberwatch_protocol::program::WatchedProcess;
 use emberwatch_protocol::responder::ActiveControl;
 use emberwatch_protocol::throttle::Throttle;
@@ -180,6 +182,21 @@ pub fn announce_reach(reach: &Reach) {
     }
     for closed_in in &reach.closed_in {
         tracing::warn!("{closed_in}");
+    }
+}
+
+/// Warns of a kernel with which filters predict badly, and shows what to write instead.
+pub fn announce_uneven_weights(model: &Model) {
+    if let Some(uneven) = model.ratio().and_then(Ratio::uneven_place) {
+        let names = model.state_names();
+        let ([row, col], [least, most]) = (uneven.place, uneven.states.map(|it| &names[it]));
+        tracing::warn!(
+            "kernel: expected weights of all states within a factor of 2, got a sum of {} for {least:?} and {} for \
+             {most:?} in row {row}, column {col}, so filters predict badly: write transitions instead, by which each \
+             neighbour tries independently:\n{TRANSITIONS_FORM}",
+            uneven.weights[0],
+            uneven.weights[1],
+        );
     }
 }
 

@@ -245,9 +245,8 @@ pub enum ModelError {
     },
 }
 
-/// Advice about a file with kernels by own state or by zone, which earlier releases had.
-const HAZARDS: &str = r#"kernels by own state and zones are now transitions, with a map for what differs between cells:
-
+/// The form of transitions, for advice about files.
+pub const TRANSITIONS_FORM: &str = r#"
     maps = "land.npz"        # arrays [H, W] or [KH, KW, H, W]
 
     [[transitions]]
@@ -271,7 +270,8 @@ impl From<toml::de::Error> for ModelError {
                      visited cells\n";
         }
         if has(&["own", "zone", "zones", "zone_map"]) {
-            text += HAZARDS;
+            text += "kernels by own state and zones are now transitions, with a map for what differs between cells:\n";
+            text += TRANSITIONS_FORM;
         }
         Self::Toml(text)
     }

@@ -32,13 +32,13 @@ pub use description::{DescribedState, Description};
 pub use dynamics::Dynamics;
 pub use file::{
     KernelEntry, MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, ModelError, ModelFile, ObservationEntry,
-    SensorEntry, StateEntry, TransitionEntry, parse_color,
+    SensorEntry, StateEntry, TRANSITIONS_FORM, TransitionEntry, parse_color,
 };
 pub use frame::{Coverage, Frame, UNOBSERVED};
 pub use grid::{Cell, Grid, Probabilities, Shape};
 pub use hazards::Hazards;
 pub use maps::MapsEntry;
-pub use parameters::{Model, Ratio, Rule};
+pub use parameters::{Model, Ratio, Rule, UnevenPlace};
 pub use parts::Parts;
 pub use path::Move;
 pub use transition::Transition;

@@ -10,7 +10,7 @@ use super::check::Checker;
 use super::file::{LEAST_SHARE, ModelError, ModelFile, SensorEntry};
 use super::grid::{Cell, Grid, Shape};
 use super::hazards::Hazards;
-use ndarray::{Array1, Array2, Array4, Axis};
+use ndarray::{Array1, Array2, Array4, ArrayView1, Axis};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -28,6 +28,17 @@ pub enum Rule {
 pub struct Ratio {
     kernel: Array4<f64>,
     bias: Array1<f64>,
+}
+
+/// A place of a kernel where the weights of two states differ by more than a factor of 2.
+#[derive(Debug, Clone, PartialEq)]
+pub struct UnevenPlace {
+    /// Row and column in the kernel.
+    pub place: [usize; 2],
+    /// The states with the smallest and the largest weight, summed over the next states.
+    pub states: [usize; 2],
+    /// These two weights.
+    pub weights: [f64; 2],
 }
 
 /// A checked model. Every value of this type is valid for simulation and filtering.
@@ -328,5 +339,57 @@ impl Ratio {
     /// Returns the transition biases `b[to]`, shape `[S]`. All are `>= 0` (eq. 2).
     pub fn bias(&self) -> &Array1<f64> {
         &self.bias
+    }
+
+    /// Returns the first place of the kernel where the weights of two states differ by more than a factor of 2.
+    ///
+    /// The filter of such a model predicts badly, because it adds the weights of all states before it divides.
+    pub fn uneven_place(&self) -> Option<UnevenPlace> {
+        let sums = self.kernel.sum_axis(Axis(0));
+        let uneven = |([row, col], weights): ([usize; 2], ArrayView1<f64>)| {
+            let order = |a: &usize, b: &usize| weights[*a].total_cmp(&weights[*b]);
+            let states = 0..weights.len();
+            let states = [states.clone().min_by(order)?, states.max_by(order)?];
+            let weights = states.map(|state| weights[state]);
+            (weights[1] > 2.0 * weights[0]).then_some(UnevenPlace {
+                place: [row, col],
+                states,
+                weights,
+            })
+        };
+        let (_, height, width) = sums.dim();
+        let places = (0..height).flat_map(|row| (0..width).map(move |col| [row, col]));
+        let mut places = places.zip(sums.lanes(Axis(0)));
+        places.find_map(uneven)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns the uneven place of the wildfire whose fire has `scale` times its weight.
+    fn scaled(scale: f64) -> Option<([usize; 2], usize)> {
+        let mut file = Model::wildfire().file().clone();
+        for entry in file.kernel.iter_mut().filter(|entry| entry.from == "fire") {
+            entry.scale *= scale;
+        }
+        let model = Model::new(file).expect("a model");
+        let uneven = model.ratio().and_then(Ratio::uneven_place)?;
+        assert!(uneven.weights[1] > 2.0 * uneven.weights[0]);
+        let fire = uneven.states.iter().position(|&state| state == 2);
+        Some((uneven.place, fire.expect("fire")))
+    }
+
+    #[test]
+    fn places_are_uneven_above_a_factor_of_two() {
+        for name in Model::built_in_names() {
+            let model = Model::built_in(name).expect("built in");
+            assert_eq!(model.ratio().and_then(Ratio::uneven_place), None, "{name}");
+        }
+        // Fire has weight .12 in the first row, .1 in the second and .08 in the third, and the other states have .1.
+        assert_eq!(scaled(1.6), None);
+        assert_eq!(scaled(1.7), Some(([0, 0], 1)));
+        assert_eq!(scaled(0.6), Some(([2, 0], 0)));
     }
 }

@@ -4,8 +4,10 @@ use super::error::SnapshotError;
 use crate::config::Checked;
 use crate::world::Rules;
 use bincode::{Decode, Encode};
-use emberwatch_model::ModelError;
+use emberwatch_model::hazards::Hazards;
+use emberwatch_model::maps::Maps;
 use emberwatch_model::text::shortened;
+use emberwatch_model::{ModelError, ModelFile};
 use sha2::{Digest, Sha256};
 use std::fmt::Display;
 
@@ -20,7 +22,7 @@ const WORLDS: u32 = 1;
 /// The settings of a server on which its worlds depend.
 #[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
 pub struct Settings {
-    /// The model file as TOML.
+    /// The model file as TOML, without its maps.
     pub model: String,
     /// All other settings, as pairs of name and value.
     pub others: Vec<(String, String)>,
@@ -64,7 +66,10 @@ impl Settings {
     /// Extracts the settings on which worlds depend.
     pub fn of(checked: &Checked) -> Self {
         let config = &checked.config;
-        let model = toml::to_string(checked.model.file());
+        let file = ModelFile {
+            maps: None,
+            ..checked.model.file().clone()
+        };
         let text = |value: &dyn Display| value.to_string();
         let others: [(&str, String); 8] = [
             ("height", text(&checked.shape.height())),
@@ -85,10 +90,13 @@ impl Settings {
                 ("states_offset", text(&config.states_offset)),
             ]
         });
+        let maps = checked.model.hazards().map(Hazards::maps);
+        let maps = maps.filter(|maps| !maps.is_empty());
+        let maps = maps.map(|maps| ("maps", digest(maps)));
         let task = checked.task.iter().map(|task| (TASK, task.name.clone()));
-        let others = others.into_iter().chain(of_states).chain(task);
+        let others = others.into_iter().chain(of_states).chain(maps).chain(task);
         Self {
-            model: model.expect("invariant: a model was read from TOML"),
+            model: toml::to_string(&file).expect("invariant: a model was read from TOML"),
             others: others.map(|(name, value)| (name.into(), value)).collect(),
         }
     }
@@ -108,11 +116,7 @@ impl Settings {
                 hash.update(format!("{name} = {value}\n"));
             }
         }
-        let digits = hash.finalize();
-        digits[..8]
-            .iter()
-            .map(|byte| format!("{byte:02x}"))
-            .collect()
+        hexadecimal(&hash.finalize()[..8])
     }
 
     /// Checks that these settings, which come from a file, equal a server's settings.
@@ -146,4 +150,20 @@ impl Settings {
         }
         Ok(())
     }
+}
+
+/// Returns the SHA-256 of the names, shapes and values of maps in hexadecimal digits.
+fn digest(maps: &Maps) -> String {
+    let mut hash = Sha256::new();
+    for (name, map) in maps {
+        hash.update(format!("{name:?} {:?}\n", map.shape()));
+        for factor in map {
+            hash.update(factor.to_le_bytes());
+        }
+    }
+    hexadecimal(&hash.finalize())
+}
+
+fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
