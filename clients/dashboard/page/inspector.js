@@ -2,8 +2,8 @@
 
 import { make, swatch } from "./elements.js";
 import { NEVER, rampColor } from "./palette.js";
-import { cellsOf, hasLand, shapeOf } from "./wire.js";
-import { beliefAge, beliefNames, isTeam, observationNames, seenSince, stateNames } from "./words.js";
+import { cellsOf, mapsOf, shapeOf } from "./wire.js";
+import { beliefAge, beliefNames, isTeam, observationNames, seenSince, short, stateNames } from "./words.js";
 
 // Time from the last key to the announcement of the cell, so that held keys do not flood a screen reader.
 const QUIET_MILLIS = 400;
@@ -54,7 +54,11 @@ function rowsOf(picture, { row, col }) {
   const at = row * shapeOf(picture).width + col;
   const rows = [];
   if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture), "states"));
-  if (hasLand(picture)) rows.push({ name: "land", value: landText(picture, at), kind: "land" });
+  if (arrays.no_fly) rows.push({ name: "land", value: arrays.no_fly[at] ? "no-fly" : "free" });
+  mapsOf(picture).forEach(({ name, range: [least, most] }, map) => {
+    const share = arrays.maps[map * cellsOf(picture) + at] / 255;
+    rows.push({ name, value: short(least + share * (most - least)), share, ramp: "map" });
+  });
   if (arrays.seen) rows.push(seenRow(picture, arrays.seen[at]));
   if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
   const cells = cellsOf(picture);
@@ -80,11 +84,6 @@ function named(name, value, names, of) {
 function ageText(age) {
   if (age === 0) return "this step";
   return age === 255 ? "255+ steps" : `${age} step${age === 1 ? "" : "s"}`;
-}
-
-function landText({ arrays, info }, at) {
-  const parts = [info.zones?.[arrays.zones?.[at]], arrays.no_fly?.[at] && "no-fly"];
-  return parts.filter(Boolean).join(", ") || "free";
 }
 
 function entropyRow(value, states) {

@@ -1,12 +1,8 @@
-// Draws lines over the cells, in device pixels: around zones unless there are many, hatches over no-fly cells, and
-// around the observed cells. Each line has a dark and a light stroke side by side, so that one of the two is visible on
+// Draws lines over the cells, in device pixels: hatches over no-fly cells, and a line around the observed cells. Each line has a dark and a light stroke side by side, so that one of the two is visible on
 // any cell.
 
 import { NEVER } from "./palette.js";
-import { cellsOf, hasLand, shapeOf } from "./wire.js";
-
-/** Maximum number of zones that get lines around them and names in the legend. */
-export const MAX_ZONES = 8;
+import { cellsOf, shapeOf } from "./wire.js";
 
 // Minimum size of a cell, in CSS pixels, for lines. They would hide smaller cells.
 const MIN_LINE_CELL = 3;
@@ -14,20 +10,19 @@ const MIN_LINE_CELL = 3;
 const HATCH = { min: 4, max: 9 };
 const DARK = "#141414";
 const LIGHT = "#ffffff";
-// Widths of the light line and of the dark line on top of it, and the dark line's dashes, in CSS pixels.
-const SOLID = { light: 2.4, dark: 1.2, dash: [] };
-const THIN = { light: 2, dark: 1, dash: [] };
-const DOTTED = { light: 1, dark: 1, dash: [2, 2] };
+// Widths of the light line and of the dark line on top of it, in CSS pixels.
+const SOLID = { light: 2.4, dark: 1.2 };
+const THIN = { light: 2, dark: 1 };
 
 // The layer is kept, because it is the same for all panels and rarely changes.
 let kept = { key: "", layer: null };
 
-/** Draws the zones' lines and the no-fly hatches on a panel's marks. */
+/** Draws the no-fly hatches on a panel's marks. */
 export function drawLand(frame, picture) {
-  const { arrays: { zones, no_fly: noFly }, info } = picture;
-  if (!hasLand(picture)) return;
+  const { arrays: { no_fly: noFly }, info } = picture;
+  if (!noFly) return;
   const { width, height, ratio } = frame;
-  const key = JSON.stringify([info.pid, shapeOf(picture), Boolean(zones), Boolean(noFly), width, height, ratio]);
+  const key = JSON.stringify([info.pid, shapeOf(picture), width, height, ratio]);
   if (key !== kept.key) kept = { key, layer: layerOf(frame, picture) };
   frame.context.drawImage(kept.layer, 0, 0);
 }
@@ -40,12 +35,8 @@ export function drawFootprint(frame, picture) {
 }
 
 function layerOf(frame, picture) {
-  const { arrays: { zones, no_fly: noFly }, info } = picture;
   const layer = new OffscreenCanvas(frame.width, frame.height);
-  const onLayer = { ...frame, context: layer.getContext("2d") };
-  const hasLines = zones && info.zones.length <= MAX_ZONES && frame.cell.x >= MIN_LINE_CELL * frame.ratio;
-  if (hasLines) outline(onLayer, picture, (at) => zones[at], DOTTED);
-  if (noFly) hatch(onLayer, picture, noFly);
+  hatch({ ...frame, context: layer.getContext("2d") }, picture, picture.arrays.no_fly);
   return layer;
 }
 
@@ -86,12 +77,10 @@ function hatch({ context, ratio, width, height, cell }, picture, noFly) {
   context.restore();
 }
 
-function stroke(context, ratio, { light, dark, dash }) {
-  for (const [color, width, dashes] of [[LIGHT, light, []], [DARK, dark, dash]]) {
+function stroke(context, ratio, { light, dark }) {
+  for (const [color, width] of [[LIGHT, light], [DARK, dark]]) {
     context.strokeStyle = color;
     context.lineWidth = width * ratio;
-    context.setLineDash(dashes.map((length) => length * ratio));
     context.stroke();
   }
-  context.setLineDash([]);
 }

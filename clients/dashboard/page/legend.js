@@ -1,7 +1,6 @@
 // The legends, which explain colours and marks.
 
 import { make, swatch } from "./elements.js";
-import { MAX_ZONES } from "./land.js";
 import { rampStops } from "./palette.js";
 import { beliefNames, observationNames, stateNames } from "./words.js";
 
@@ -17,12 +16,12 @@ export function createLegend(list, ramps) {
       const observations = observationNames(picture);
       const believed = beliefNames(picture).length;
       const { theme } = palette;
-      const { state_colours: ofStates, observation_colours: ofObservations, zones, zone_colours: ofZones } = picture.info;
+      const { state_colours: ofStates, observation_colours: ofObservations } = picture.info;
       const hasNoFly = Boolean(picture.arrays.no_fly);
-      const key = JSON.stringify([states, observations, believed, theme, ofStates, ofObservations, zones, ofZones, hasNoFly]);
+      const key = JSON.stringify([states, observations, believed, theme, ofStates, ofObservations, hasNoFly]);
       if (key === drawn) return false;
       drawn = key;
-      list.replaceChildren(...values(states, observations, palette), ...marks(palette, zones, hasNoFly));
+      list.replaceChildren(...values(states, observations, palette), ...marks(palette, hasNoFly));
       ramps.replaceChildren(...(believed ? [
         ramp("belief", theme, "belief: probability of the state", ["0", "0.25", "0.5", "0.75", "1"]),
         ramp("entropy", theme, "entropy of a cell, nats", entropyTicks(believed)),
@@ -53,14 +52,8 @@ function word(text) {
   return make("li", "word", {}, text);
 }
 
-function marks(palette, zones, hasNoFly) {
-  return [...unobserved(palette, zones), ...(hasNoFly ? [mark("no-fly")] : []), mark("path"), mark("start"), mark("robot")];
-}
-
-function unobserved({ unseen, unseenZones }, zones) {
-  if (!zones) return [value("not observed", unseen)];
-  if (zones.length > MAX_ZONES) return [word(`not observed: ${zones.length} zones`)];
-  return [word("not observed"), ...named(zones, unseenZones)];
+function marks({ unseen }, hasNoFly) {
+  return [value("not observed", unseen), ...(hasNoFly ? [mark("no-fly")] : []), mark("path"), mark("start"), mark("robot")];
 }
 
 function mark(name) {

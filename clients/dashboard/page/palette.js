@@ -23,6 +23,10 @@ const RAMPS = {
     light: ["#fff5e8", "#fcdbc2", "#fbbda6", "#f3a099", "#e38598", "#cc6f9c", "#a9629c", "#865796", "#644c8a"],
     dark: ["#1e1b25", "#382340", "#592855", "#79315d", "#97405e", "#b2525b", "#c86958", "#d38762", "#dba475"],
   },
+  map: {
+    light: ["#f4f4f4", "#dcdcdc", "#c4c4c4", "#adadad", "#969696", "#808080", "#6b6b6b", "#565656", "#424242"],
+    dark: ["#1c1c1c", "#303030", "#464646", "#5c5c5c", "#737373", "#8b8b8b", "#a4a4a4", "#bdbdbd", "#d7d7d7"],
+  },
 };
 
 // Colours of a team's paths and robots. All are light, so that dark edges and numbers are visible on them.
@@ -48,21 +52,17 @@ export const NEVER = 255;
 const OLDEST_SHARE = 0.4;
 const HALF_AGE = 24;
 
-// The share of the zone's colour in a cell that was not observed. It stays distinct from the full colours of states and
-// observations.
-const ZONE_SHARE = 0.4;
-
 /**
  * Returns the colours of a picture's model under a theme. `states` and `observations` have a "#rrggbb" for any byte;
  * `unseen` is a single colour. The tables of pixels are `stateTable` and `frameTable`, indexed by value, `seenTable` by
- * `value * 256 + age`, `rampTable(name)` by 0..255. For cells not observed: `unseenZones` and `zoneTable`, by zone.
+ * `value * 256 + age`, `rampTable(name)` by 0..255.
  */
 export function paletteOf(picture, theme) {
-  const { state_colours: states, observation_colours: observations, zone_colours: zones } = picture.info ?? {};
-  return remembered([theme, states, observations, zones], () => make({ states, observations, zones, theme }));
+  const { state_colours: states, observation_colours: observations } = picture.info ?? {};
+  return remembered([theme, states, observations], () => make({ states, observations, theme }));
 }
 
-function make({ states: ownStates, observations: ownObservations, zones, theme }) {
+function make({ states: ownStates, observations: ownObservations, theme }) {
   const states = colorsOf(ownStates);
   const observations = colorsOf(ownObservations);
   const unseen = unlike([...(ownStates ?? COLORS), ...(ownObservations ?? [])], UNSEEN[theme]);
@@ -73,8 +73,6 @@ function make({ states: ownStates, observations: ownObservations, zones, theme }
     states,
     observations,
     unseen,
-    unseenZones: zones?.map((color) => `#${mixed(unseen, color).map(hexadecimal).join("")}`),
-    zoneTable: table(256, (at) => mixed(unseen, zones?.[at] ?? unseen)),
     stateTable: table(256, value(states)),
     frameTable: table(256, seen),
     seenTable: table(65536, (at) => faded(seen(at >> 8), channels(unseen), at & 255)),
@@ -144,10 +142,6 @@ function unlike(colors, greys) {
 function distance(one, other) {
   const [a, b] = [channels(one), channels(other)];
   return a.reduce((sum, channel, i) => sum + (channel - b[i]) ** 2, 0);
-}
-
-function mixed(unseen, zone) {
-  return blend(channels(unseen), channels(zone), ZONE_SHARE);
 }
 
 // Returns the colour of an observation made `age` steps ago.

@@ -2,9 +2,8 @@
 
 import { make, write } from "./elements.js";
 import { drawMarks } from "./overlay.js";
-import { NEVER } from "./palette.js";
-import { beliefAge, beliefNames, panelSentence, seenSince, stateNames } from "./words.js";
-import { cellsOf, hasLand, shapeOf } from "./wire.js";
+import { beliefAge, beliefNames, panelSentence, rangeOf, seenSince, stateNames } from "./words.js";
+import { cellsOf, mapsOf, shapeOf } from "./wire.js";
 
 const OBSERVED = [
   { id: "truth", kind: "truth", title: "truth", hint: "hidden" },
@@ -24,18 +23,22 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
   /** Rebuilds the panels if their number, names or shape have changed. Returns whether it rebuilt them. */
   function build(picture) {
     const beliefs = namesOf(picture);
-    const landLines = hasLand(picture) ? 1 : 0;
-    const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length, landLines]);
+    const maps = mapsOf(picture);
+    const landLines = maps.length + (picture.arrays.no_fly ? 1 : 0);
+    const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length, maps, landLines]);
     if (key === built.key) return false;
     const add = (panel) => element(panel, picture, { hold, release });
     const panels = OBSERVED.map(add);
     const believed = beliefs.map((name, state) => add(
       { id: `belief-${state}`, kind: "belief", title: "belief", name, state, hint: `p(${name})` }));
     if (beliefs.length > 0) believed.push(add(ENTROPY));
-    const row = believed.map((panel) => panel.figure);
-    parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief(picture)]));
+    const ofMaps = maps.map(({ name, range }, state) => add(
+      { id: `map-${state}`, kind: "map", title: "map", name, state, hint: rangeOf(range) }));
+    const figures = (all) => all.map((panel) => panel.figure);
+    const row = believed.length ? figures(believed) : [noBelief(picture)];
+    parent.replaceChildren(...figures(panels), inspector, ...row, ...figures(ofMaps));
     release();
-    built = { key, world: picture.world, beliefs, panels: [...panels, ...believed], landLines };
+    built = { key, world: picture.world, beliefs, panels: [...panels, ...believed, ...ofMaps], landLines };
     return true;
   }
 
@@ -70,7 +73,7 @@ function element(panel, picture, { hold, release }) {
   const figure = make("figure", "panel", { panel: panel.id });
   const caption = make("figcaption");
   caption.append(make("b", "", {}, panel.name ? `${panel.title}: ${panel.name}` : panel.title));
-  caption.append(make("span", "hint", {}, panel.name ? "" : panel.hint));
+  caption.append(make("span", "hint", {}, panel.kind === "belief" ? "" : panel.hint));
   const grid = make("div", "grid");
   grid.tabIndex = 0;
   grid.setAttribute("role", "group");
@@ -104,7 +107,6 @@ function paint(panel, picture, cell, palette) {
   if (values) {
     const pixels = new Uint32Array(panel.image.data.buffer);
     fill(pixels, values, panel, picture, palette);
-    if (picture.arrays.zones && ["seen", "frame"].includes(panel.kind)) fillZones(pixels, values, picture.arrays, palette);
     panel.context.putImageData(panel.image, 0, 0);
   }
   drawMarks(panel.marks, picture, { cell, hasPaths: panel.kind === "frame" && Boolean(values) });
@@ -120,20 +122,17 @@ function fill(pixels, values, { kind }, { arrays }, palette) {
   for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[values[i]];
 }
 
-function fillZones(pixels, values, { zones }, { zoneTable }) {
-  for (let i = 0; i < pixels.length; i += 1) if (values[i] === NEVER) pixels[i] = zoneTable[zones[i]];
-}
-
 function tableOf(kind, palette) {
-  if (kind === "belief" || kind === "entropy") return palette.rampTable(kind);
+  if (["belief", "entropy", "map"].includes(kind)) return palette.rampTable(kind);
   return kind === "truth" ? palette.stateTable : palette.frameTable;
 }
 
 function valuesOf({ kind, state }, picture) {
   const { arrays } = picture;
-  if (kind !== "belief") return arrays[kind];
+  const planes = { belief: arrays.belief, map: arrays.maps };
+  if (!(kind in planes)) return arrays[kind];
   const cells = cellsOf(picture);
-  return arrays.belief?.subarray(state * cells, (state + 1) * cells);
+  return planes[kind]?.subarray(state * cells, (state + 1) * cells);
 }
 
 function absence({ kind }, picture) {

@@ -39,9 +39,9 @@ export function cellsOf(picture) {
   return shape && shape.height * shape.width;
 }
 
-/** Returns whether a picture has zones or no-fly cells. */
-export function hasLand({ arrays }) {
-  return Boolean(arrays.zones ?? arrays.no_fly);
+/** Returns the maps of the model, as { name, range }; empty if the picture shows none. */
+export function mapsOf({ info, arrays }) {
+  return arrays.maps ? info.maps : [];
 }
 
 function header(buffer) {
@@ -58,13 +58,15 @@ function header(buffer) {
 function checkGrids(picture, arrays) {
   const cells = cellsOf(picture);
   if (!cells) return;
-  for (const name of ["truth", "frame", "seen", "age", "entropy", "zones", "no_fly"]) {
+  for (const name of ["truth", "frame", "seen", "age", "entropy", "no_fly"]) {
     if (arrays[name] && arrays[name].length !== cells) {
       throw new Error(`array ${name}: expected ${cells} cells, got ${arrays[name].length}`);
     }
   }
-  if (arrays.belief && arrays.belief.length % cells !== 0) {
-    throw new Error(`array belief: expected a multiple of ${cells}, got ${arrays.belief.length}`);
+  for (const name of ["belief", "maps"]) {
+    if (arrays[name] && arrays[name].length % cells !== 0) {
+      throw new Error(`array ${name}: expected a multiple of ${cells}, got ${arrays[name].length}`);
+    }
   }
 }
 

@@ -18,6 +18,11 @@ export function short(value) {
   return value.toFixed(size >= 10 ? 1 : size >= 1 ? 2 : 3);
 }
 
+/** Formats the range of a map's factors: 0.412 to 2.03. */
+export function rangeOf([least, most]) {
+  return `${short(least)} to ${short(most)}`;
+}
+
 /** Returns the text, or a dash if there is none. */
 export function text(value) {
   return value == null || value === "" ? UNKNOWN : String(value);
@@ -80,6 +85,8 @@ export function panelSentence(panel, picture) {
     case "frame":
       return `this path: ${whole(shown.n_visited)} cells visited, ${whole(shown.n_hits)} of them ` +
         `${targetName(picture)}, ${isTeam(shown) ? "robots" : "robot"} at ${places(shown)} ${at}`;
+    case "map":
+      return `map ${panel.name}: factors from ${panel.hint}`;
     case "belief":
       return `belief ${panel.name}: mean probability ${share(picture, panel)} ${believed}`;
     default:

@@ -8,7 +8,7 @@ use crate::album::Strip;
 use crate::entry::Entry;
 use crate::last_seen::LastSeen;
 use crate::scene::{Info, Lost, Player, Scene};
-use emberwatch_protocol::Airspace;
+use emberwatch_protocol::{Airspace, Grid};
 use emberwatch_protocol::control::ServerStatus;
 use emberwatch_protocol::frame::UNOBSERVED;
 use serde::{Deserialize, Serialize};
@@ -240,15 +240,23 @@ impl Arrays {
         last.since
     }
 
-    /// Adds the maps of zones and no-fly cells, unless the entry's grid differs from the server's.
+    /// Adds the model's maps, one after another, and that of no-fly cells, unless the entry's grid differs from the
+    /// server's.
     fn add_land(&mut self, info: Option<&Info>, entry: &Entry) {
-        let zones = info.and_then(|info| info.zone_map.clone());
         let airspace = info.and_then(|info| info.airspace.as_ref());
         let no_fly = airspace.and_then(|airspace| airspace.no_fly());
         let no_fly = no_fly.map(|map| map.mapv(u8::from));
-        for (name, map) in [("zones", zones), ("no_fly", no_fly)] {
-            if let Some(map) = map.filter(|map| map.dim() == entry.shape.dim()) {
-                self.add_bytes(name, &map.iter().copied().collect::<Vec<_>>());
+        let fits = |map: &&Grid<u8>| map.dim() == entry.shape.dim();
+        let maps = info.into_iter().flat_map(|info| &info.levels).filter(fits);
+        for (name, maps) in [
+            ("maps", maps.collect()),
+            ("no_fly", Vec::from_iter(no_fly.as_ref().filter(fits))),
+        ] {
+            if !maps.is_empty() {
+                self.add_bytes(
+                    name,
+                    &maps.into_iter().flatten().copied().collect::<Vec<_>>(),
+                );
             }
         }
     }

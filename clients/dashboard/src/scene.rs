@@ -3,8 +3,9 @@
 use crate::album::Album;
 use crate::entry::States;
 use emberwatch_protocol::control::{CoverageRule, ServerInfo, ServerStatus};
-use emberwatch_protocol::model::Description;
+use emberwatch_protocol::model::{Description, Hazards};
 use emberwatch_protocol::{Airspace, Grid, Model};
+use ndarray::{ArrayD, Axis, Ix4, s};
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
@@ -71,11 +72,11 @@ pub struct Info {
     observation_colours: Option<Vec<String>>,
     /// Number of rows and columns that robots see beyond their path.
     radius: usize,
-    zones: Option<Vec<String>>,
-    zone_colours: Option<Vec<String>>,
-    /// The zone of each cell.
+    /// The maps of the model.
+    maps: Vec<MapInfo>,
+    /// For each map, a level of 0 to 255 for each cell, from its smallest to its largest factor.
     #[serde(skip)]
-    pub zone_map: Option<Grid<u8>>,
+    pub levels: Vec<Grid<u8>>,
     /// Where robots may fly; `None` if the server's description of it is invalid.
     #[serde(skip)]
     pub airspace: Option<Airspace>,
@@ -83,6 +84,45 @@ pub struct Info {
     max_steps: u64,
     coverage: CoverageRule,
     publish_truth: bool,
+}
+
+/// A map of a model.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MapInfo {
+    name: String,
+    /// The smallest and the largest factor.
+    range: [f32; 2],
+}
+
+impl MapInfo {
+    /// Describes a map, and returns its levels. A map with factors for each place of a neighbour is averaged over the
+    /// places other than the centre.
+    fn of((name, map): (&String, &ArrayD<f32>)) -> (Self, Grid<u8>) {
+        let of_cells = match map.view().into_dimensionality::<Ix4>() {
+            Ok(of_neighbours) => {
+                let (height, width, ..) = of_neighbours.dim();
+                let all = of_neighbours.sum_axis(Axis(0)).sum_axis(Axis(0));
+                let centre = of_neighbours.slice(s![height / 2, width / 2, .., ..]);
+                (all - centre) / (height * width - 1).max(1) as f32
+            }
+            Err(_) => map
+                .clone()
+                .into_dimensionality()
+                .expect("invariant: two or four axes"),
+        };
+        let least = of_cells.fold(f32::MAX, |least, factor| factor.min(least));
+        let most = of_cells.fold(0.0_f32, |most, factor| factor.max(most));
+        let scale = 255.0 / (most - least).max(f32::MIN_POSITIVE);
+        let levels = of_cells.mapv(|factor| ((factor - least) * scale) as u8);
+        let range = [least, most];
+        (
+            Self {
+                name: name.clone(),
+                range,
+            },
+            levels,
+        )
+    }
 }
 
 /// A scene shared by many readers.
@@ -134,9 +174,8 @@ impl Info {
             file.map(|file| file.states.iter().map(of).cloned().collect())
         };
         let airspace = info.airspace().ok();
-        let zones = info.zones.as_ref();
-        let zone_map = zones.and_then(|zones| zones.zone_map(info.shape().ok()?).ok());
-        let zones = zones.filter(|_| zone_map.is_some());
+        let maps = model.as_ref().and_then(Model::hazards).map(Hazards::maps);
+        let (maps, levels) = maps.into_iter().flatten().map(MapInfo::of).unzip();
         let colours = file.map(|file| file.observations.iter().map(|one| one.color.clone()));
         Self {
             pid: info.pid,
@@ -152,9 +191,8 @@ impl Info {
             observations: info.observations.clone(),
             observation_colours: colours.map(Iterator::collect),
             radius: airspace.as_ref().map_or(0, Airspace::radius),
-            zones: zones.map(|zones| zones.names.clone()),
-            zone_colours: zones.map(|zones| zones.colors.clone()),
-            zone_map,
+            maps,
+            levels,
             airspace,
             burn_in: info.burn_in,
             max_steps: info.max_steps,
