@@ -43,7 +43,7 @@ edge = "healthy"
 maps = "forest.npz"
 states = [
     {{ name = "healthy", color = "#2e8b57", initial = 0.9744, observed_as = [0.9, 0.05, 0.05] }},
-    {{ name = "burning", color = "#c8371b", initial = 0.0256, reward = 1.0, observed_as = [0.05, 0.9, 0.05] }},
+    {{ name = "burning", color = "#c8371b", initial = 0.0256, reward = 1, observed_as = [0.05, 0.9, 0.05] }},  # noqa: E501
     {{ name = "burnt", color = "#4a4a4a", initial = 0.0, observed_as = [0.05, 0.05, 0.9] }},
 ]
 observations = [

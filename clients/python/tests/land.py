@@ -1,4 +1,4 @@
-"""Models of lively worlds with a sensor, no-fly cells and zones."""
+"""Models of lively worlds with a sensor, no-fly cells and maps."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -26,30 +26,71 @@ NO_FLY: Cells = np.array(
 )
 
 
-def model(
-    *,
-    radius: int = 0,
-    no_fly: Cells | str | None = None,
-    zone_map: NDArray[np.uint8] | str | None = None,
-) -> str:
-    """Returns the text of a model with an exact sensor. Maps may be names of files next to it."""
+def model(*, radius: int = 0, no_fly: Cells | str | None = None) -> str:
+    """Returns the text of a model with an exact sensor. The map may be the name of a file."""
     keys = [f"sensor = {{ radius = {radius} }}"]
     keys += [f"no_fly = {_rows(no_fly)}"] if no_fly is not None else []
     text = Path(LIVELY).read_text()
     for state, old in enumerate(("[0.98, 0.01, 0.01]", "[0.80, 0.15, 0.05]", "[0.01, 0.01, 0.98]")):
         text = text.replace(old, str(np.eye(3)[state].tolist()))
-    if zone_map is not None:
-        keys += [f"zone_map = {_rows(zone_map)}"]
-        keys += [
-            'zones = [{ name = "land", color = "#010203" }, { name = "sea", color = "#040506" }]'
-        ]
-        head, *kernels = text.split("[[kernel]]\n")
-        entries = "".join(f'[[kernel]]\nzone = "land"\n{kernel}' for kernel in kernels)
-        stays = "weights = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]\n"
-        for name in ("normal", "latent", "fire"):
-            entries += f'[[kernel]]\nzone = "sea"\nfrom = "{name}"\nto = "{name}"\n{stays}'
-        text = head + entries
     return text.replace("kernel_size = [3, 3]\n", "kernel_size = [3, 3]\n" + "\n".join(keys) + "\n")
+
+
+#: A model of hazards on a 7 x 5 grid, whose maps are in `land.npz`.
+HAZARDS = """
+name = "land"
+maps = "land.npz"
+states = [
+    { name = "green", color = "#000000", initial = 0.8, observed_as = [0.9, 0.05, 0.05] },
+    { name = "fire", color = "#111111", initial = 0.2, reward = 1, observed_as = [0.1, 0.8, 0.1] },
+    { name = "ash", color = "#222222", initial = 0.0, observed_as = [0.05, 0.05, 0.9] },
+]
+observations = [
+    { name = "green", color = "#000000" },
+    { name = "fire", color = "#111111" },
+    { name = "ash", color = "#222222" },
+]
+
+[[transitions]]
+from = "green"
+to = "fire"
+base = 0.01
+near.fire = [[0.1, 0.3, 0.1], [0.3, 0.0, 0.2], [0.1, 0.3, 0.1]]
+times = ["fuel", "wind"]
+
+[[transitions]]
+from = "green"
+to = "ash"
+base = 0.02
+near.ash = [[0.05], [0.0], [0.1]]
+
+[[transitions]]
+from = "fire"
+to = "ash"
+base = 0.2
+
+[[transitions]]
+from = "ash"
+to = "green"
+base = 0.1
+"""
+
+
+def maps(key: int) -> dict[str, NDArray[np.float32]]:
+    """Returns random maps for `HAZARDS`. Cells of the first column never burn."""
+    rng = np.random.default_rng(key)
+    fuel = rng.uniform(0.5, 2.0, (7, 5))
+    fuel[:, 0] = 0.0
+    wind = rng.uniform(0.0, 3.0, (3, 3, 7, 5))
+    return {"fuel": fuel.astype(np.float32), "wind": wind.astype(np.float32)}
+
+
+def write_hazards(folder: Path, key: int) -> Path:
+    """Writes the model and its maps. Returns the path of the model."""
+    path = folder / "hazards.toml"
+    path.write_text(HAZARDS)
+    np.savez(folder / "land.npz", **maps(key))  # pyright: ignore
+    return path
 
 
 def _rows(cells: NDArray[Any] | str) -> str:

@@ -1,6 +1,7 @@
-"""Sensors that see beyond the path, no-fly cells and zones, checked by loops over all cells."""
+"""Sensors that see beyond the path, no-fly cells and maps, checked by loops over all cells."""
 
 import copy
+import pickle
 import warnings
 from itertools import product
 from pathlib import Path
@@ -115,7 +116,7 @@ def test_windows_show_what_can_still_be_found(seeing: Any) -> None:
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
 def test_airspace_passes_the_checker_and_equals_a_servers(seeing: Any, name: str) -> None:
-    keywords = seeing(radius=2, zone_map=np.eye(*SHAPE, dtype=np.uint8))
+    keywords = seeing(radius=2)
     parts = ALL_MOVES if name == MOVES else ("frame", "image", "robot", "age", "belief")
     here = make(name, **keywords, observation=parts)
     check_env(make(name, **keywords).unwrapped, skip_render_check=True)
@@ -128,8 +129,6 @@ def test_airspace_passes_the_checker_and_equals_a_servers(seeing: Any, name: str
         for env in (running, here):
             info = env.unwrapped.lease.client.info
             assert info.airspace.no_fly.tolist() == land.NO_FLY.tolist() and hash(info)
-            assert (info.zones.names, info.zones.colors[0]) == (("land", "sea"), "#010203")
-            assert info.zones.map.tolist() == np.eye(*SHAPE, dtype=int).tolist()
 
 
 def test_a_radius_can_be_combined_with_a_model() -> None:
@@ -172,36 +171,29 @@ def test_recorded_worlds_support_sensor_radius(tmp_path: Path) -> None:
 
 
 def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
-    zones = np.arange(35, dtype=np.uint8).reshape(SHAPE) & 1
-    whole = Model.from_toml(land.model(radius=3, no_fly=land.NO_FLY, zone_map=zones))
+    whole = Model.from_toml(land.model(radius=3, no_fly=land.NO_FLY))
     assert whole.sensor_radius == 3
     assert whole.no_fly is not None and whole.no_fly.dtype == np.bool_
     assert np.array_equal(whole.no_fly, land.NO_FLY)
-    assert whole.zone_map is not None and whole.zone_map.dtype == np.uint8
-    assert np.array_equal(whole.zone_map, zones)
-    assert whole.zone_names == ("land", "sea")
-    assert whole.zone_colors == ((1, 2, 3), (4, 5, 6))
-    assert whole.kernels.shape == (2, 3, 3, 3, 3) and not whole.sees_own_state
+    assert whole.kernel is not None and whole.kernel.shape == (3, 3, 3, 3)
     assert whole.observation_names == ("normal", "latent", "fire")
     assert whole.observation_colors == whole.state_colors
     expected = oracle.parameters(whole.toml)
-    assert np.array_equal(whole.kernels, expected.kernels)
     assert np.array_equal(whole.observation_matrix, expected.observed)
-    # Maps in files next to the model file equal maps in it.
+    # A map in a file next to the model file equals a map in it.
     path = tmp_path / "model.toml"
-    path.write_text(land.model(radius=3, no_fly="no_fly.npy", zone_map="zones.npy"))
+    path.write_text(land.model(radius=3, no_fly="no_fly.npy"))
     np.save(tmp_path / "no_fly.npy", land.NO_FLY)
-    np.save(tmp_path / "zones.npy", zones)
     beside = Model.named(path)
     assert beside == whole == Model.from_toml(beside.toml) == copy.deepcopy(whole)
-    assert whole != Model.from_toml(land.model(radius=3, zone_map=zones))
+    assert whole != Model.from_toml(land.model(radius=3))
     with refuses("emberwatch-server --check"):
         Model.from_toml(path.read_text())
-    (tmp_path / "zones.npy").unlink()
-    with refuses("zones.npy"):
+    (tmp_path / "no_fly.npy").unlink()
+    with refuses("no_fly.npy"):
         Model.named(path)
     plain = Model.wildfire()
-    assert (plain.airspace, plain.zone_map, plain.zone_names) == (Airspace(), None, ())
+    assert (plain.airspace, plain.maps) == (Airspace(), {})
     assert plain.with_radius(0) is plain
     assert whole.with_radius(1).with_radius(3) == whole
     with refuses("radius: expected an integer within 0 to 8, got 9"):
@@ -210,11 +202,32 @@ def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     assert described.with_radius(4).airspace == Airspace(radius=4)
 
 
-def test_the_filter_uses_zones() -> None:
+def test_a_model_carries_its_maps(tmp_path: Path) -> None:
+    path = land.write_hazards(tmp_path, 1)
+    model = Model.named(path)
+    for name, expected in land.maps(1).items():
+        assert np.array_equal(model.maps[name], expected)
+    (tmp_path / "land.npz").unlink()
+    copies = Model.from_toml(model.toml), copy.deepcopy(model), pickle.loads(pickle.dumps(model))
+    for same in copies:
+        assert same == model and np.array_equal(same.maps["wind"], model.maps["wind"])
+    env = make(model=model, height=7, width=5)
+    assert env.unwrapped.model == model
+    land.write_hazards(tmp_path, 2)
+    assert Model.named(path) != model
+    np.savez(tmp_path / "land.npz", fuel=np.ones((7, 5)), wind=np.ones((3, 7, 5)))
+    with refuses(r'maps: "wind": expected shape \[H, W\] or \[KH, KW, H, W\]'):
+        Model.named(path)
+    (tmp_path / "land.npz").write_bytes(b"no archive")
+    with refuses(r"land.npz: expected an \.npz \(zip\) archive"):
+        Model.named(path)
+
+
+def test_the_filter_uses_maps(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
-    zones = rng.integers(0, 2, SHAPE, np.uint8)
-    text = land.model(radius=2, zone_map=zones)
-    model, expected = Model.from_toml(text), oracle.parameters(text)
+    path = land.write_hazards(tmp_path, 3)
+    maps = {name: factors.astype(float) for name, factors in land.maps(3).items()}
+    model, expected = Model.named(path), oracle.parameters(land.HAZARDS, maps)
     belief = np.moveaxis(rng.dirichlet(np.ones(3), SHAPE), -1, 0)
     frame = rng.choice(np.array([*range(3), 255], np.uint8), SHAPE)
     kept = known(model, prior=belief)
@@ -223,9 +236,8 @@ def test_the_filter_uses_zones() -> None:
     np.testing.assert_allclose(posterior, oracle.bayes(expected, belief, frame), atol=1e-6)
     kept.predict()
     np.testing.assert_allclose(kept.belief, oracle.phi(expected, posterior), atol=1e-6)
-    assert np.allclose(kept.belief[:, zones == 1], posterior[:, zones == 1])
     assert simulated_prior(model, height=7, width=5, burn_in=20).shape == (3, 7, 5)
-    with refuses("model: zone_map: expected a map of the 5 x 5 grid, got 7 x 5"):
+    with refuses("model: maps: expected a map of the 5 x 5 grid, got 7 x 5"):
         known(model, prior=np.full((3, 5, 5), 1 / 3))
 
 

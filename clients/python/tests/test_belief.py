@@ -32,7 +32,7 @@ def golden(name: str) -> dict[str, NDArray[np.generic]]:
 
 
 def model_of(*, kernel: NDArray, bias: NDArray, matrix: NDArray) -> Model:
-    """Makes a model of any shape. A kernel of five axes begins with the cell's own state."""
+    """Makes a model of any shape."""
     n_states, n_observations = matrix.shape
     lines = ['name = "test"', f"kernel_size = {list(kernel.shape[-2:])}"]
     for s in range(n_states):
@@ -41,10 +41,9 @@ def model_of(*, kernel: NDArray, bias: NDArray, matrix: NDArray) -> Model:
         lines += [f"observed_as = {matrix[s].tolist()}"]
     for o in range(n_observations):
         lines += ["[[observations]]", f'name = "o{o}"', 'color = "#000000"']
-    for *own, to, start in np.ndindex(kernel.shape[:-2]):
+    for to, start in np.ndindex(kernel.shape[:2]):
         lines += ["[[kernel]]", f'from = "s{start}"', f'to = "s{to}"']
-        lines += [f'own = "s{o}"' for o in own]
-        lines += [f"weights = {kernel[*own, to, start].tolist()}"]
+        lines += [f"weights = {kernel[to, start].tolist()}"]
     return Model.from_toml("\n".join(lines))
 
 
@@ -72,8 +71,7 @@ def any_model(draw: st.DrawFn) -> Model:
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     n_states, n_observations = draw(st.integers(2, 6)), draw(st.integers(1, 5))
     size = 2 * draw(st.integers(0, 3)) + 1, 2 * draw(st.integers(0, 3)) + 1
-    own = (n_states,) if draw(st.booleans()) else ()
-    kernel = rng.choice([0.0, 0.25, rng.random()], (*own, n_states, n_states, *size))
+    kernel = rng.choice([0.0, 0.25, rng.random()], (n_states, n_states, *size))
     bias = rng.random(n_states) + 1e-3
     matrix = rng.dirichlet(np.ones(n_observations), n_states)
     return model_of(kernel=kernel, bias=bias, matrix=matrix)

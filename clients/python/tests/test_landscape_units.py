@@ -17,6 +17,7 @@ from emberwatch.landscape.__main__ import main
 from emberwatch.landscape.compass import bearing
 from emberwatch.landscape.ground import is_same
 from emberwatch.landscape.lengths import METRES, side, unit_named
+from emberwatch.model import Model
 
 FOOT, SURVEY_FOOT = 0.3048, 1200 / 3937
 #: Length of a degree in metres; a sphere is accurate to 0.2 degrees of slope.
@@ -110,11 +111,12 @@ def raster(path: Path, place: Map) -> Path:
 def test_a_slope_is_the_same_in_every_unit_and_projection(case: str, tmp_path: Path) -> None:
     place = SLOPES[case]
     file = raster(tmp_path / "dem", place)
-    model = made(tmp_path, file, "--slope-step=0.1", *place.flags.split())
-    names = [zone["name"] for zone in model["zones"]]
-    assert names
-    for name in names:
-        assert float(name.split()[0]) == pytest.approx(10, abs=0.2) and "north-east" in name, name
+    made(tmp_path, file, *place.flags.split())
+    factors = Model.named(tmp_path / "new" / "land.toml").maps["slope_wind"]
+    # Degrees up from the neighbour in the west, and from the one in the south.
+    for row, col, share in ((1, 0, 0.6), (2, 1, 0.8)):
+        expected = math.degrees(math.atan(share * math.tan(math.radians(10))))
+        assert np.log(factors[row, col]) / 0.078 == pytest.approx(expected, abs=0.2)
 
 
 def notes(capsys: pytest.CaptureFixture[str]) -> str:
@@ -204,17 +206,18 @@ def test_mask_cells_without_a_value_are_free(
     towns = np.full((4, 5), 255, "u1")
     towns[1:3, 2:] = 1
     mask = geotiff(tmp_path / "towns.tif", towns, nodata=255, dtype="uint8")
-    model = made(tmp_path, geotiff(tmp_path / "dem.tif", EASTWARD), "--no-fly", mask)
-    np.testing.assert_array_equal(model["no_fly"], towns == 1)
+    made(tmp_path, geotiff(tmp_path / "dem.tif", EASTWARD), "--no-fly", mask)
+    no_fly = Model.named(tmp_path / "new" / "land.toml").no_fly
+    assert no_fly is not None and np.array_equal(no_fly, towns == 1)
     assert f"{mask}: 6 no-fly cells; 14 of the other cells have no value" in notes(capsys)
 
 
-def test_a_flag_sets_the_zone_of_cells_without_a_value(tmp_path: Path) -> None:
+def test_a_flag_sets_the_class_of_cells_without_a_value(tmp_path: Path) -> None:
     fuel = np.array([[1, 1, -9999], [2, -9999, 2]])
-    zones = geotiff(tmp_path / "fuel.tif", fuel, nodata=-9999, dtype="int16")
-    model = made(tmp_path, "--zones", zones, "--missing-zone", 0, "--unburnable", 0)
-    assert [zone["name"] for zone in model["zones"]] == ["zone 0, never burns", "zone 1", "zone 2"]
-    assert model["zone_map"] == [[1, 1, 0], [2, 0, 2]]
+    classes = geotiff(tmp_path / "fuel.tif", fuel, nodata=-9999, dtype="int16")
+    made(tmp_path, "--fuel", classes, "--missing-class", 0, "--unburnable", 0)
+    maps = Model.named(tmp_path / "new" / "land.toml").maps
+    assert maps["fuel"].tolist() == [[1, 1, 0], [1, 0, 1]]
 
 
 def test_the_wind_can_be_given_as_a_compass_point(tmp_path: Path) -> None:

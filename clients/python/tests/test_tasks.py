@@ -66,7 +66,9 @@ def test_the_package_contains_the_programs_files() -> None:
     def texts(pattern: str) -> dict[str, str]:
         return {file.stem: file.read_text("utf-8") for file in CONFIG.glob(pattern)}
 
-    assert built_in("models") == texts("models/*.toml")
+    models = built_in("models")
+    assert models.pop("wildfire-terrain") != texts("models/*.toml")["wildfire-terrain"]  # its maps
+    assert models.items() <= texts("models/*.toml").items()
     assert built_in("tasks") == texts("tasks/*.toml")
     assert built_in("states") == texts("landscapes/*/*.toml")
     for name, task in TASKS.items():
@@ -74,8 +76,8 @@ def test_the_package_contains_the_programs_files() -> None:
     with refuses("task ash: No such file .*expected a file, or one of wildfire, small, "):
         Task.named("ash")
     for name, task in TASKS.items():  # ids end episodes with the task
-        for kind, n_moves in (("-v0", 1), ("Moves-v0", task.n_moves), ("Objective-v1", 1)):
-            spec = gymnasium.spec(f"emberwatch/{task.ids}{kind}")
+        for kind, first, n_moves in (("", 0, 1), ("Moves", 0, task.n_moves), ("Objective", 1, 1)):
+            spec = gymnasium.spec(f"emberwatch/{task.ids}{kind}-v{first + task.version}")
             assert spec.max_episode_steps == n_moves * task.max_steps
             assert spec.kwargs == ({} if name == "wildfire" else {"task": name})
 
@@ -91,13 +93,14 @@ def are_same(makers: list[Any], steps: int) -> None:
 def test_a_task_equals_its_settings_by_hand(name: str) -> None:
     task, hand = TASKS[name], by_hand(name)
     ids, n_rows, n_moves = f"emberwatch/{task.ids}", 2 * task.robots, 2 * task.n_moves
+    version = f"-v{task.version}"
     make, many = gymnasium.make, partial(gymnasium.make_vec, num_envs=n_rows)
-    are_same([lambda: many(f"{ids}-v0"), lambda: many(WILDFIRE, **hand)], 3)
+    are_same([lambda: many(f"{ids}{version}"), lambda: many(WILDFIRE, **hand)], 3)
     if task.robots == 1:
         file = CONFIG / f"tasks/{name}.toml"
-        are_same([lambda: make(f"{ids}Moves-v0"), lambda: make(MOVES, task=file)], n_moves)
+        are_same([lambda: make(f"{ids}Moves{version}"), lambda: make(MOVES, task=file)], n_moves)
     if name == "small":
-        are_same([lambda: many(f"{ids}Moves-v0"), lambda: many(MOVES, **hand)], n_moves)
+        are_same([lambda: many(f"{ids}Moves{version}"), lambda: many(MOVES, **hand)], n_moves)
         for kind in ("-v0", "Moves-v0", "Objective-v1"):
             with no_warnings():
                 env = make(f"{ids}{kind}", disable_env_checker=True)
@@ -132,6 +135,14 @@ def test_keywords_set_by_a_task_are_refused() -> None:
     assert rollout(env, TASKS["small"].max_steps, seed=1001)[-1][3], "it ends episodes"
     with refuses('task : expected a name or a file, got ""'):
         gymnasium.make(WILDFIRE, task="")
+
+
+def test_earlier_versions_of_worlds_are_refused_by_name() -> None:
+    with (
+        pytest.warns(DeprecationWarning),
+        pytest.raises(gymnasium.error.DeprecatedEnv, match="emberwatch/WildfireSparse-v1|`v1`"),
+    ):
+        gymnasium.make("emberwatch/WildfireSparse-v0")
 
 
 def test_a_running_server_must_have_the_task() -> None:

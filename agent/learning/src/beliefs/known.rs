@@ -21,7 +21,7 @@ pub const KNOWN: BeliefKind = BeliefKind {
 
 pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
     name: "known+cavities",
-    about: "known without a cell's influence on itself; known, if the model has a kernel",
+    about: "known; with hazards, without a cell's influence on itself",
     handover: Some(|model| BayesFilter::handover_of_known(model, true)),
     build: |conditions| Ok(Box::new(filter(conditions, true)?)),
     ..KNOWN

@@ -101,7 +101,7 @@ class CheckedSettings:
 
     @property
     def task(self) -> tuple[str, int, int, int, int, int, str, int] | None:
-        """Name, moves, robots, steps, first and end of the test seeds, prefix and version of ids."""
+        """Name, moves, robots, steps, first and end of test seeds, prefix and version of ids."""
 
     @property
     def worlds_fingerprint(self) -> str:

@@ -59,7 +59,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
       as many burning cells as estimators with a known model.
         * `"known"`: the Bayes filter with the true model
         * `"known+spatial"`: known, where observations also correct neighbouring cells
-        * `"known+cavities"`: known, predicting a cell without its own influence on its neighbours
+        * `"known+cavities"`: known; with hazards, without a cell's influence on itself
         * `"known+spatial+cavities"`: known+spatial, predicting like known+cavities
         * `"learned"`: a Bayes filter with learned parameters
         * `"learned+spatial"`: learned, where observations also correct neighbouring cells

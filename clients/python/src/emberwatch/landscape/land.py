@@ -61,7 +61,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
-    add("--out", type=Path, required=True, metavar="FILE.toml", help="the model file; its maps go to FILE.npz")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE.toml",
+        help="the model file; its maps go to FILE.npz",
+    )
     add(
         "--cell",
         metavar="METRES",
@@ -163,7 +169,9 @@ def _check_flags(flags: argparse.Namespace) -> None:
             word = "ELEVATION" if needed == "elevation" else "--fuel"
             raise InvalidArgumentError(f"--{flag.replace('_', '-')}: applies only with {word}")
     if flags.fuel is not None and (flags.factors, flags.unburnable) == (None, None):
-        raise InvalidArgumentError("--fuel: expected --factors or --unburnable with it, got neither")
+        raise InvalidArgumentError(
+            "--fuel: expected --factors or --unburnable with it, got neither"
+        )
     flags.cell = None if flags.cell is None else side("--cell", flags.cell)
     if flags.missing_class is not None and abs(flags.missing_class) > _MOST_NUMBER:
         raise invalid("--missing-class", f"at most {_MOST_NUMBER}", flags.missing_class)

@@ -58,9 +58,7 @@ def gradient(elevation: NDArray[np.float64], width: float, height: float) -> NDA
     return np.stack([eastward, -southward])
 
 
-def slope_and_wind(
-    rise: NDArray[np.float64], speed: float, towards: float
-) -> NDArray[np.float64]:
+def slope_and_wind(rise: NDArray[np.float64], speed: float, towards: float) -> NDArray[np.float64]:
     """Returns the factors of each neighbour's spread to each cell, shape (3, 3, H, W).
 
     `rise`: slopes, as from `gradient`. `speed`: wind speed in m/s. `towards`: the direction to
