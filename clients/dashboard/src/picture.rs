@@ -8,9 +8,9 @@ use crate::album::Strip;
 use crate::entry::Entry;
 use crate::last_seen::LastSeen;
 use crate::scene::{Info, Lost, Player, Scene};
-use emberwatch_protocol::{Airspace, Grid};
 use emberwatch_protocol::control::ServerStatus;
 use emberwatch_protocol::frame::UNOBSERVED;
+use emberwatch_protocol::{Airspace, Grid};
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 

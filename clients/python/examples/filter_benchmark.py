@@ -43,12 +43,12 @@ edge = "healthy"
 maps = "forest.npz"
 states = [
     {{ name = "healthy", color = "#2e8b57", initial = 0.9744, observed_as = [0.9, 0.05, 0.05] }},
-    {{ name = "burning", color = "#c8371b", initial = 0.0256, reward = 1, observed_as = [0.05, 0.9, 0.05] }},  # noqa: E501
+    {{ name = "burning", color = "#c8371b", initial = 0.0256, reward = 1, observed_as = [0.05, 0.9, 0.05] }},
     {{ name = "burnt", color = "#4a4a4a", initial = 0.0, observed_as = [0.05, 0.05, 0.9] }},
 ]
 observations = [
     {{ name = "healthy", color = "#2e8b57" }},
-    {{ name = "burning", color = "#c8371b" }},
+    {{ name = "burning", color = "#c8371b", initial = 0.0256, reward = 1, observed_as = [0.05, 0.9, 0.05] }},
     {{ name = "burnt", color = "#4a4a4a" }},
 ]
 
@@ -62,7 +62,7 @@ times = ["rate"]
 from = "burning"
 to = "burnt"
 base = {1.0 - BURNS_ON}
-"""
+"""  # noqa: E501
 
 
 def model() -> Model:

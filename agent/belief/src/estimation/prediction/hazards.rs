@@ -173,7 +173,7 @@ impl HazardPrediction {
         let n_cavities = self.beliefs.n_cavities;
         self.work.next.fill([0.0; LANES]);
         self.work.next_cavities.fill([0.0; LANES]);
-        for own in 0..self.n_states {
+        for (own, changes) in changes.iter().enumerate() {
             let has_cavities = self.susceptible == Some(own);
             let here = *self.belief(n_cavities, own, place);
             let (mut product, mut last) = ([1.0; LANES], [1.0; LANES]);
@@ -181,7 +181,7 @@ impl HazardPrediction {
                 self.work.rest.fill([1.0; LANES]);
                 self.work.last.fill([1.0; LANES]);
             }
-            for change in &changes[own] {
+            for change in changes {
                 if !change.neighbours.is_empty() {
                     product = self.multiply(change, place, has_cavities);
                 }

@@ -145,7 +145,9 @@ def _make(flags: argparse.Namespace) -> None:
     files = {key: utf8("--out", file.name) for key, (file, _) in contents.items()}
     comments = "".join(f"# {line}\n" for line in (_origin(flags, layers), *notes))
     text = f"{comments}\n{model_text(name, files, list(maps))}".encode()
-    write(dict(contents.values()) | {flags.out: lambda file: file.write(text)})
+    fills: dict[Path, Fill] = dict(contents.values())
+    fills[flags.out] = lambda file: file.write(text)
+    write(fills)
     height, width = shape
     print(shown(f"{flags.out}: {height} x {width} cells, maps: {', '.join(maps) or 'none'}"))
     for note in notes:
@@ -225,7 +227,8 @@ def _check_grid(layer: Layer, first: Layer) -> None:
 def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:
     """Returns the factor of each cell's class of fuel, shape (H, W)."""
     classes, places = np.unique(_whole(layer, flags.missing_class), return_inverse=True)
-    table: dict[int, float] = (flags.factors or {}) | dict.fromkeys(flags.unburnable or (), 0.0)
+    table: dict[int, float] = dict(flags.factors or {})
+    table |= dict.fromkeys(flags.unburnable or (), 0.0)
     missing = set(table).difference(classes.tolist())
     if missing:
         expected = f"classes that occur in {flags.fuel}"

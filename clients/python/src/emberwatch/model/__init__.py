@@ -8,7 +8,7 @@ ones. `emberwatch.belief` applies the parameters to a belief.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,8 +184,10 @@ class Model(Description):
 def _plain(value: Any) -> Any:
     """Converts arrays, and the arrays of a mapping, to lists, which can be compared."""
     if isinstance(value, np.ndarray):
-        return value.tolist()
-    return {key: _plain(it) for key, it in value.items()} if isinstance(value, dict) else value
+        return cast("NDArray[Any]", value).tolist()
+    if isinstance(value, dict):
+        return {key: _plain(it) for key, it in cast("dict[str, Any]", value).items()}
+    return value
 
 
 def color_from_hex(text: str) -> Color:

@@ -260,8 +260,10 @@ def _panels(
 
 def _land(palette: Palette, scenery: Scenery) -> list[tuple[_Mark, str]]:
     """Returns the legend of unseen cells and of no-fly cells."""
-    unseen: list[tuple[_Mark, str]] = [(palette.unobserved, "not seen")]
-    return unseen + ([] if scenery.no_fly is None else [("no-fly", "no-fly")])
+    marks: list[tuple[_Mark, str]] = [(palette.unobserved, "not seen")]
+    if scenery.no_fly is not None:
+        marks.append(("no-fly", "no-fly"))
+    return marks
 
 
 def _levels(shares: NDArray[np.float64]) -> NDArray[np.uint8]:
