@@ -207,9 +207,11 @@ mod tests {
             let name = settings.split(" = ").next().unwrap_or_default();
             assert_eq!(error.to_string(), format!("{name}: expected {expected}"));
         }
-        for (settings, words) in [("objective.belief = 'prior'", "`predictor` or `estimate`")] {
-            let error = AgentConfig::from_toml(settings).expect_err(settings);
-            assert!(error.to_string().contains(words), "{error}");
-        }
+        let error =
+            AgentConfig::from_toml("objective.belief = 'prior'").expect_err("no such belief");
+        assert!(
+            error.to_string().contains("`predictor` or `estimate`"),
+            "{error}"
+        );
     }
 }

@@ -48,7 +48,7 @@ states = [
 ]
 observations = [
     {{ name = "healthy", color = "#2e8b57" }},
-    {{ name = "burning", color = "#c8371b", initial = 0.0256, reward = 1, observed_as = [0.05, 0.9, 0.05] }},
+    {{ name = "burning", color = "#c8371b" }},
     {{ name = "burnt", color = "#4a4a4a" }},
 ]
 
@@ -72,7 +72,7 @@ def model() -> Model:
         path = Path(folder) / "forest.toml"
         path.write_text(MODEL)
         np.savez(path.with_name("forest.npz"), rate=rate)
-        return Model.from_file(path)
+        return Model.named(path)
 
 
 def burn(random: np.random.Generator) -> NDArray[np.uint8]:

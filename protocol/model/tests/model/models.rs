@@ -85,8 +85,8 @@ pub fn random_hazards(
                 2.0 * number() as f32
             }
         };
-        let fuel = ArrayD::from_shape_fn(vec![rows, cols], |at| factor(at));
-        let wind = ArrayD::from_shape_fn(vec![height, width, rows, cols], |at| factor(at));
+        let fuel = ArrayD::from_shape_fn(vec![rows, cols], &mut factor);
+        let wind = ArrayD::from_shape_fn(vec![height, width, rows, cols], factor);
         let maps = [("fuel".to_owned(), fuel), ("wind".to_owned(), wind)].into();
         file.maps = Some(MapsEntry::packed(&maps));
     }

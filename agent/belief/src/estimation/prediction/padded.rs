@@ -141,7 +141,7 @@ impl PaddedBeliefs {
                 let cavity = &mut self.probabilities[at..][..n_lanes];
                 for (lane, p) in cavity.iter_mut().enumerate() {
                     if is_changed[lane] && total[lane] > 0.0 {
-                        *p *= factor[lane] / total[lane];
+                        *p = *p * factor[lane] / total[lane];
                     }
                 }
             }
