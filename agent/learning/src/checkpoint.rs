@@ -139,7 +139,10 @@ impl Contents {
     pub fn settings(&self) -> Result<AgentConfig> {
         let is_there = !self.settings.is_empty();
         check(is_there, SETTINGS, "the settings of an agent", "none")?;
-        let config = AgentConfig::from_toml(&self.settings);
+        // Earlier versions also saved the kind of kernels.
+        let lines = self.settings.lines();
+        let lines = lines.filter(|line| !line.starts_with("kernels = "));
+        let config = AgentConfig::from_toml(&lines.collect::<Vec<_>>().join("\n"));
         config.map_err(|error| wrong(SETTINGS, "the settings of an agent", error))
     }
 

@@ -10,7 +10,7 @@ fn state() -> State {
 fn contents() -> Contents {
     let kernel = ("kernel".into(), vec![2, 2], vec![1.0, -0.5, 0.0, 3e-9]);
     let mut contents = Contents::new([kernel], &state());
-    contents.settings = "seed = 3".into();
+    contents.settings = "seed = 3\nkernels = \"neighbours\"".into();
     contents
 }
 
