@@ -1,10 +1,10 @@
 //! Compares the recursion with its definition: gradients with finite differences, and predictions with the filter.
 
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_gradient::{Recursion, Sighting};
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Frame, Model, Shape};
+use emberwatch_model::{Cell, Frame, Shape};
 use ndarray::ArrayView;
 
 /// Observations of a few cells of a made-up world. Different frames observe different cells.
@@ -155,26 +155,21 @@ fn a_window_ends_with_the_filters_prediction() {
         n_observations: 3,
         kernel: (3, 3),
     };
-    for tables in [
-        Parameters::first(dimensions, 2).tables(),
-        Tables::of_model(&Model::wildfire()),
-    ] {
-        let shape = shape(7, 18);
-        let mut filter = BayesFilter::learned(&tables, tables.prior(shape));
-        let mut window = Recursion::new(tables, shape, 8);
-        let frames: Vec<_> = (0..8).map(|number| sightings(shape, 3, number)).collect();
-        let mut end = vec![0.0; 3 * shape.n_cells()];
-        window.run(None, &frames, &mut end);
-        for sightings in &frames {
-            let mut frame = Frame::empty(shape);
-            for seen in sightings {
-                frame.observe(seen.cell as usize, seen.value);
-            }
-            filter.correct(&frame).expect("possible");
-            filter.predict();
+    let (tables, shape) = (Parameters::first(dimensions, 2).tables(), shape(7, 18));
+    let mut filter = BayesFilter::learned(&tables, tables.prior(shape));
+    let mut window = Recursion::new(tables, shape, 8);
+    let frames: Vec<_> = (0..8).map(|number| sightings(shape, 3, number)).collect();
+    let mut end = vec![0.0; 3 * shape.n_cells()];
+    window.run(None, &frames, &mut end);
+    for sightings in &frames {
+        let mut frame = Frame::empty(shape);
+        for seen in sightings {
+            frame.observe(seen.cell as usize, seen.value);
         }
-        let pairs = filter.belief().as_slice().iter().zip(&end);
-        let most = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        assert!(most < 1e-6, "{most}");
+        filter.correct(&frame).expect("possible");
+        filter.predict();
     }
+    let pairs = filter.belief().as_slice().iter().zip(&end);
+    let most = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(most < 1e-6, "{most}");
 }

@@ -7,7 +7,7 @@
 
 use crate::estimation::belief::Belief;
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES, Model, Shape};
+use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES, Shape};
 use ndarray::{Array2, Array4};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -219,38 +219,11 @@ impl Tables {
         Belief::everywhere(&self.initial, shape)
     }
 
-    /// Returns the tables of a known model, which learned tables should approach.
-    ///
-    /// The tables omit the bias. Beliefs sum to one, so away from the edges a bias has the same effect as a neighbour's
-    /// weight that is equal for all states of the neighbour.
-    ///
-    /// # Panics
-    /// If it is a model of hazards.
-    pub fn of_model(model: &Model) -> Self {
-        let ratio = model.ratio().expect("model: expected a kernel");
-        let cast = |value: &f64| *value as f32;
-        let (_, _, height, width) = ratio.kernel().dim();
-        Self {
-            dimensions: Dimensions {
-                n_states: model.n_states(),
-                n_observations: model.n_observations(),
-                kernel: (height, width),
-            },
-            kernel: ratio.kernel().iter().map(cast).collect(),
-            likelihood: model.likelihood().iter().map(cast).collect(),
-            initial: model.initial().iter().map(cast).collect(),
-        }
-    }
-
     /// Returns the kernel as an array of shape `[S, S, KH, KW]`.
     pub fn kernel_array(&self) -> Array4<f64> {
         let (n, (height, width)) = (self.dimensions.n_states, self.dimensions.kernel);
-        let weights = self
-            .kernel
-            .iter()
-            .map(|&weight| f64::from(weight))
-            .collect();
-        let kernel = Array4::from_shape_vec((n, n, height, width), weights);
+        let weights = self.kernel.iter().map(|&weight| f64::from(weight));
+        let kernel = Array4::from_shape_vec((n, n, height, width), weights.collect());
         kernel.expect("invariant: S x S kernels")
     }
 

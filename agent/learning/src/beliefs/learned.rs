@@ -111,9 +111,8 @@ impl SavedModel {
 
     /// Loads the model, with its tensors from a part of a checkpoint.
     pub fn read(&self, part: &Part<'_>) -> Result<LearnedModel> {
-        let dimensions = checked(self.dimensions, part)?;
-        let parameters = read_parameters(dimensions, part, "")?;
-        check_target(self.target, dimensions.n_states)?;
+        let parameters = read_parameters(self.dimensions, part, "")?;
+        check_target(self.target, self.dimensions.n_states)?;
         let correlations = self.correlations.clone();
         Ok(LearnedModel::new(parameters, self.target, correlations))
     }
@@ -139,31 +138,23 @@ pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] 
     })
 }
 
-/// Checks the dimensions of a stored filter.
+/// Loads parameters or moments with the given dimensions. Their names are [`Parameters::NAMES`] with a suffix.
 ///
 /// # Errors
-/// If a dimension is out of range, or the filter has kernels that depend on the cell's own state or zone.
-pub fn checked(dimensions: Dimensions, part: &Part<'_>) -> Result<Dimensions> {
-    let n_axes = part.shape(Parameters::NAMES[0]).map_or(4, <[usize]>::len);
-    check(
-        n_axes == 4 && part.shape("zones").is_none(),
-        "kernel",
-        "the same weights in every cell",
-        "kernels by own state or zone: train the filter again",
-    )?;
-    let checked = dimensions.check();
-    checked.map_err(|error| wrong("dimensions", "valid dimensions of a filter", error))
-}
-
-/// Loads parameters or moments with the given dimensions. Their names are [`Parameters::NAMES`] with a suffix.
+/// If a dimension is out of range, a tensor is missing or has another form, or the filter has several kernels.
 pub fn read_parameters(
     dimensions: Dimensions,
     part: &Part<'_>,
     suffix: &str,
 ) -> Result<Parameters> {
+    let checked = dimensions.check();
+    checked.map_err(|error| wrong("dimensions", "valid dimensions of a filter", error))?;
+    let names = Parameters::NAMES.map(|name| format!("{name}{suffix}"));
+    let is_one = part.shape(&names[0]).is_none_or(|shape| shape.len() == 4);
+    let got = "kernels by own state or zone: train the filter again";
+    check(is_one, &names[0], "one kernel for all cells", got)?;
     let shapes = dimensions.shapes();
-    let tensor =
-        |at: usize| part.tensor(&format!("{}{suffix}", Parameters::NAMES[at]), &shapes[at]);
+    let tensor = |at: usize| part.tensor(&names[at], &shapes[at]);
     Ok(Parameters {
         dimensions,
         tensors: [tensor(0)?, tensor(1)?, tensor(2)?],

@@ -7,7 +7,7 @@ mod saved;
 pub use self::saved::SavedFilter;
 
 use self::saved::SavedRobot;
-use crate::beliefs::learned::{LearnedModel, checked};
+use crate::beliefs::learned::LearnedModel;
 use crate::beliefs::{LEARNED, numbered_states};
 use crate::checkpoint::Contents;
 use crate::config::AgentConfig;
@@ -56,7 +56,7 @@ pub const FILTER: LearnerKind = LearnerKind {
     },
     read: |contents, _, learned| {
         let mut fit = contents.state::<SavedFilter>()?.fit;
-        let dimensions = checked(fit.optimiser.dimensions(), &contents.part(""))?;
+        let dimensions = fit.optimiser.dimensions();
         fit.load(contents, dimensions)?;
         Ok(learned.put(fit.learned()))
     },
