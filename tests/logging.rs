@@ -223,7 +223,7 @@ fn unusable_levels_are_named_once_and_the_default_holds() {
         (Some("info=info=info"), 1, true),
     ] {
         let mut command = Command::new(program_path(AGENT));
-        command.args(["run", "--instance", "nobody", "--wait", "0.1"]);
+        command.args(["run", "--instance", "nobody", "--wait", "1"]);
         command
             .env_remove("RUST_LOG")
             .envs(level.map(|level| ("RUST_LOG", level)));

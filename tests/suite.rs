@@ -179,7 +179,7 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     let training = folder.path(&format!("runs/tiny/training.{}", killed.pid()));
     killed.until(|| training.exists());
     killed.wait_for_words("learning");
-    killed.signal(Signal::INT);
+    killed.signal(Signal::TERM);
     killed.wait(LIMIT);
     assert!(!folder.path("runs/tiny/filter").exists());
     let first = suite("--train --train-steps 64");
