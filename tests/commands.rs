@@ -6,7 +6,7 @@ use tests::harness::{
     AGENT, Ended, Folder, LIMIT, Program, SERVER, SMALL, Server, new_instance, run,
 };
 
-/// Flags of a very short comparison that starts its own server.
+/// Flags of a very short comparison.
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
                     --policies coverage --baseline coverage";
 
@@ -47,7 +47,7 @@ run --robots 0..2 => --team
 run --team --robots 3..3 => --robots | FIRST below END
 run --team --share => --share | --team
 run --robot 1 --robots 0..2 --team => '--robot <ROBOT>' cannot be used with '--robots
-run --model no.toml => model file no.toml | No such file: expected a model file, or one of | wildfire, wildfire-burnout
+run --model no.toml => model file no.toml | No such file | expected a file, or one of | wildfire, wildfire-burnout
 run --checkpoint /dev/zero => checkpoint /dev/zero: expected a regular file
 run --config no.toml => config file no.toml | No such file
 run --preset lab => --preset | default, paper
@@ -63,11 +63,12 @@ compare --robots 1,65 => --robots | 1..=64
 compare --team apart => --team | alone, shared, joint, oracle
 compare --policies coverage,coverage => each name once | got "coverage" twice
 compare --baseline ash => --baseline | expected one of | got "ash"
-compare --height 0 => height and width in 1..=4096, got 0 x 64
-compare --server no/such => start no/such | No such file
-compare --instance nobody --wait 0 => no server on instance "nobody"
+compare --height 0 => height: expected 1 to 4096, got 0
+compare --instance nobody => no server on instance "nobody"
 compare --instance nobody --policies coverage,ash => policy: expected one of random_walk | got "ash"
 compare --instance x --height 9 => --instance | --height
+compare --instance x --robots 2 => --instance | --robots
+compare --task small --moves 9 => moves: expected to be left out, as the task decides it, got 9
 compare TINY --csv /proc/no/file.csv => create /proc/no
 compare TINY --csv / => --csv: write /: expected a regular file, got a folder
 compare TINY --csv /dev/null => --csv: write /dev/null: expected a regular file
@@ -128,8 +129,7 @@ run SERVER => does not reveal its model | --model FILE",
         ),
         (
             "--publish-truth",
-            "compare SERVER --policies coverage --burn-in 7 => expected the running server's 20, got 7
-run SERVER --robot 1 => robots: expected a part of the world's robots 0..1, got 1..2
+            "run SERVER --robot 1 => robots: expected a part of the world's robots 0..1, got 1..2
 run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\"",
         ),
         (
@@ -163,23 +163,13 @@ fn status_and_a_second_server_report_the_first() {
 }
 
 #[test]
-fn agents_wait_for_the_server_that_is_started_with_them() {
-    let folder = Folder::default();
-    let train = format!("train --out {} --worlds 1 --steps 3", folder.word("out"));
-    let compare = "compare --policies coverage --baseline coverage --seeds 0..1 --steps 1";
-    for command in ["run --steps 3", &train, compare] {
-        let instance = new_instance();
-        let flags = format!("{command} --wait 60 --instance {}", instance.name());
-        let agent = Program::start(AGENT, &flags);
-        agent.wait_for_words("waiting up to");
-        let _server = Server::start_on(&instance, &format!("{SMALL} --worlds 2 --publish-truth"));
-        let ended = agent.ends(0);
-        assert_eq!(
-            ended.stderr.matches("waiting up to").count(),
-            1,
-            "{command}"
-        );
-    }
+fn an_agent_waits_for_the_server_that_is_started_with_it() {
+    let instance = new_instance();
+    let agent = Program::agent(&instance, "--steps 3 --wait 60");
+    agent.wait_for_words("waiting up to");
+    let _server = Server::start_on(&instance, SMALL);
+    let ended = agent.ends(0);
+    assert_eq!(ended.stderr.matches("waiting up to").count(), 1);
     let agent = Program::agent(&new_instance(), "--wait 1e18");
     agent.wait_for_words("waiting up to");
     agent.finish();

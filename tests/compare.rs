@@ -12,7 +12,7 @@ use tests::harness::{Folder, Program, Server, repository};
 /// The flags of a comparison, except those for its worlds.
 const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-width 4";
 
-/// Flags for the worlds, which the agent's private server simulates.
+/// Flags for the worlds.
 const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 
 /// Worlds with many fires.

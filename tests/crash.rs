@@ -142,39 +142,3 @@ fn an_abandoned_step_is_made_at_most_once() {
         assert_eq!(server.step_of(0), k + 1);
     }
 }
-
-/// Returns the instance of the private server that a program has started.
-fn private_instance(owner: u32) -> Instance {
-    let (mut name, exit_with) = (None, format!("--exit-with\0{owner}\0"));
-    let find = || {
-        let processes = std::fs::read_dir("/proc").expect("processes").flatten();
-        let lines = processes.filter_map(|it| std::fs::read(it.path().join("cmdline")).ok());
-        let mut lines = lines.map(|line| String::from_utf8_lossy(&line).into_owned());
-        let server = lines.find(|line| line.contains(&exit_with));
-        name = server.and_then(|line| {
-            let (_, rest) = line.split_once("--instance\0")?;
-            Some(rest.split('\0').next()?.to_owned())
-        });
-        name.is_some()
-    };
-    assert!(eventually(PATIENCE, find), "no server of {owner}");
-    Instance::new(&name.expect("found")).expect("a plain name")
-}
-
-#[test]
-fn the_private_server_of_a_comparison_ends_with_it() {
-    let flags = "compare --seeds 0..1 --steps 1000000 --height 5 --width 5 --moves 4 --burn-in 5 \
-                 --policies random_walk,coverage --baseline random_walk";
-    for signal in [Signal::KILL, Signal::TERM] {
-        let agent = Program::start(AGENT, flags);
-        let instance = private_instance(agent.pid());
-        agent.until(|| status(&instance).is_ok_and(|status| status.n_steps > 10));
-        agent.signal(signal);
-        agent.wait(PATIENCE);
-        let is_gone = || match status(&instance) {
-            Err(ConnectionError::Channel(error)) => matches!(error, ChannelError::NoServer { .. }),
-            _ => false,
-        };
-        assert!(eventually(PATIENCE, is_gone), "after {signal:?}");
-    }
-}

@@ -6,7 +6,7 @@ use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use rustix::process::Signal;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use tests::harness::{AGENT, Ended, Folder, LIMIT, Program, SERVER, program_path};
+use tests::harness::{AGENT, Ended, Folder, LIMIT, Program, program_path};
 
 const TASK: &str = "name = \"tiny\"
 model = \"wildfire-small\"
@@ -78,12 +78,14 @@ fn a_suite_keeps_equal_rows_and_its_results_make_a_page() {
         .suite("--policies coverage,beam_exploit --beam-width 2")
         .check_says("beam_exploit is run: its rows are from another build, checkpoint or settings");
     // A program with one more byte stands for a program built from changed files.
-    let mut program = std::fs::read(program_path(SERVER)).expect("a program");
+    let mut program = std::fs::read(program_path(AGENT)).expect("a program");
     program.push(0);
-    let other = place.0.write("server", program);
+    let other = place.0.write("agent", program);
     let executable = PermissionsExt::from_mode(0o700);
     std::fs::set_permissions(&other, executable).expect("executable");
-    let built = place.suite(&format!("--policies coverage --server {other}"));
+    let words = place.words("--policies coverage");
+    let words: Vec<&str> = words.split_whitespace().collect();
+    let built = Program::start_at(Path::new(&other), &words).wait(LIMIT);
     built.check_says("coverage is run: its rows are from another build, checkpoint or settings");
     assert_ne!(place.rows("coverage"), rows);
 
@@ -183,8 +185,8 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     killed.wait(LIMIT);
     assert!(!folder.path("runs/tiny/filter").exists());
     let first = suite("--train --train-steps 64");
-    first.check_says("task tiny: training filter for learned_beam");
-    first.check_says("task fires: training decisions for learned_policy");
+    first.check_says("training filter for learned_beam");
+    first.check_says("training decisions for learned_policy");
     first.check_says("task fires: known/options/learned is not run: it needs a known model");
     for task in ["tiny", "fires"] {
         let seconds = |policy: &str| {
@@ -214,29 +216,8 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     refused.check_says("filter is in the way of the training for");
     std::fs::remove_dir_all(folder.path("runs/tiny/filter")).expect("removed");
     let anew = suite("--train --train-steps 64");
-    anew.check_says("task tiny: training filter for learned_beam");
+    anew.check_says("training filter for learned_beam");
     assert!(checkpoint("tiny").exists());
-}
-
-#[test]
-fn a_training_is_refused_if_the_task_file_has_changed_since_the_command_began() {
-    let place = Place::new();
-    let [task, runs, server] = ["tiny.toml", "runs", "server"].map(|name| place.0.word(name));
-    // The first server only checks the task; the training starts the second one.
-    let script = format!(
-        "#!/bin/sh\nif [ -e {server}.once ]; then sed -i 's/burn_in = 300/burn_in = 301/' {task}; fi\n\
-         touch {server}.once\nexec {} \"$@\"\n",
-        program_path(SERVER).display()
-    );
-    place.0.write("server", &script);
-    let executable = PermissionsExt::from_mode(0o700);
-    std::fs::set_permissions(place.0.path("server"), executable).expect("chmod");
-    let flags = format!(
-        "--policies learned_beam --checkpoints {runs} --train --train-steps 64 --server {server}"
-    );
-    let words = "learned_beam is not run: train --learner filter: the task's files have changed since the command began";
-    check(AGENT, &place.words(&flags), words);
-    assert!(!place.0.path("runs/tiny/filter").exists());
 }
 
 #[test]

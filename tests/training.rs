@@ -100,6 +100,29 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
 }
 
 #[test]
+fn a_server_and_worlds_in_the_process_teach_the_same() {
+    let place = place();
+    place.set(&format!(
+        "{SETTINGS}[neural]\nepisode_steps = 30\nupdates_per_step = 0.5\n\
+         [decisions]\nepisode_steps = 30\nbatch = 8\nupdates_per_step = 1.0\n"
+    ));
+    for (learner, of_server) in [
+        ("filter", "--reveal-model false"),
+        ("neural", "--reveal-model false --max-steps 30"),
+        ("decisions --estimator known", "--max-steps 30"),
+    ] {
+        let flags = format!("--learner {learner} --steps 120");
+        let [inside, outside] = ["in", "on"].map(|way| format!("{way}-{}", &learner[..5]));
+        place.train(&inside, &format!("{WORLDS} {flags}"));
+        let server = Server::start(&format!("{WORLDS} --seed 1000 --coverage client {of_server}"));
+        let flags = format!("{} --worlds 2 {flags}", on(&server));
+        place.train(&outside, &flags);
+        assert!(place.rows(&inside) == place.rows(&outside), "{learner}");
+        assert!(place.contents(&inside) == place.contents(&outside));
+    }
+}
+
+#[test]
 fn a_filter_learns_from_frames_that_show_every_cell() {
     let place = place();
     place.train("path", &format!("{WORLDS} --steps 120"));
@@ -277,12 +300,11 @@ train => --out
 train --out /proc/no => create /proc/no
 train --out /tmp --freeze => --resume
 train --out OUT --worlds 0 => --worlds | 1..=1024
-train --out OUT --instance nobody --wait 0 => no server on instance \"nobody\"
+train --out OUT --instance nobody => no server on instance \"nobody\"
 train --out OUT --instance x --height 9 => --instance | --height
 train --out OUT --time-limit=-1 => --time-limit | expected a number of seconds
 train --out OUT --model no.toml => model file no.toml | No such file
-train --out OUT --world 3 => --world: expected 0
-train --out OUT --server no/such => start no/such | No such file
+train --out OUT --world 3 => --instance
 train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: No such file
 compare --checkpoint no/such => checkpoint no/such: No such file
 ";

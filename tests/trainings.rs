@@ -5,7 +5,7 @@ use emberwatch_learning::checkpoint::{self, Contents};
 use std::path::PathBuf;
 use tests::harness::{AGENT, Ended, Folder, Server};
 
-/// Flags of a private server with small worlds.
+/// Flags for small worlds.
 pub const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";
 
 /// A folder with a settings file and the output folders of trainings.

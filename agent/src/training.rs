@@ -1,8 +1,7 @@
 //! Trains a learner while it acts: a loop of steps of all robots, updates, and checkpoints at intervals.
 //!
 //! The learner receives the grid, the number of observation values, and each path's reward and frame. A model that the
-//! server reveals is read only for decisions on a known-model belief. One message to the server moves all robots by one
-//! step. The [`Learner`] determines what is learned, and how to act in the meantime.
+//! server reveals is read only for decisions on a known-model belief. One request moves all robots by one step. The [`Learner`] determines what is learned, and how to act in the meantime.
 
 mod acting;
 mod events;
@@ -16,18 +15,16 @@ pub use self::spec::{CHECKPOINT, TrainingSpec};
 
 use self::acting::Acting;
 use self::events::Events;
-use crate::client::info::connect;
+use crate::client::worlds::Worlds;
 use crate::training::metrics::{FROZEN, METRICS, Metrics, Tick};
 use crate::training::seconds::Stopwatch;
 use anyhow::{Context, Result, bail};
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_learning::checkpoint::{self, Contents};
-use emberwatch_learning::learners::{Beginning, Learner, LearnerKind, ModelUpdate, Worlds};
+use emberwatch_learning::learners::{self, Beginning, Learner, LearnerKind, ModelUpdate};
 use emberwatch_learning::rollout;
 use emberwatch_learning::served::Served;
-use emberwatch_protocol::Client;
-use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::client::{Claim, Observation};
+use emberwatch_protocol::client::{Backend, Claim, Client, Observation};
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::WorldSeed;
 use emberwatch_protocol::feed::Feed;
@@ -58,15 +55,15 @@ pub struct TrainSummary {
     pub learning: Duration,
 }
 
-/// Trains on a server until the steps are done, the deadline has passed or `stop` is set. Always saves at the end.
+/// Trains until the steps are done, the deadline has passed or `stop` is set. Always saves at the end.
 /// `contents` is the result of [`TrainingSpec::check`].
 pub fn train(
-    instance: &Instance,
+    worlds: &mut Worlds,
     spec: &TrainingSpec,
     contents: Option<Contents>,
     stop: &AtomicBool,
 ) -> Result<TrainSummary> {
-    let mut training_loop = TrainingLoop::attach(instance, spec, contents)?;
+    let mut training_loop = TrainingLoop::attach(worlds, spec, contents)?;
     let outcome = training_loop.act(spec, stop);
     let saved = training_loop.save(spec);
     match (outcome, saved) {
@@ -82,8 +79,8 @@ pub fn train(
     Ok(training_loop.summary)
 }
 
-struct TrainingLoop {
-    client: Client,
+struct TrainingLoop<'a> {
+    client: Client<&'a mut Worlds>,
     kind: &'static LearnerKind,
     learner: Box<dyn Learner>,
     metrics: Metrics,
@@ -105,9 +102,9 @@ struct Reported {
     score: Score,
 }
 
-impl TrainingLoop {
+impl<'a> TrainingLoop<'a> {
     fn attach(
-        instance: &Instance,
+        worlds: &'a mut Worlds,
         spec: &TrainingSpec,
         contents: Option<Contents>,
     ) -> Result<Self> {
@@ -117,13 +114,12 @@ impl TrainingLoop {
         {
             tracing::warn!("the settings differ from the checkpoint's, and replace them");
         }
-        let connection = connect(instance)?;
         let claim = Claim {
-            robots: spec.robots(connection.info())?,
+            robots: spec.robots(worlds.info())?,
             takeover: spec.takeover,
             time_to_live: Some(LEASE),
         };
-        let mut client = Client::acquire(connection, &claim)?;
+        let mut client = Client::acquire(worlds, &claim)?;
         let kind = spec.learner()?;
         let mut learner = begin(spec, kind, &client, contents.as_ref())?;
         let metrics = metrics(spec, kind, &*learner)?;
@@ -142,7 +138,7 @@ impl TrainingLoop {
             );
         }
         let belief = learner.rollout(0).agent.belief();
-        let feed = Feed::open(instance, belief.probabilities());
+        let feed = client.backend().feed(belief.probabilities());
         let now = Instant::now();
         Ok(Self {
             client,
@@ -269,11 +265,11 @@ impl Reported {
 fn begin(
     spec: &TrainingSpec,
     kind: &LearnerKind,
-    client: &Client,
+    client: &Client<impl Backend>,
     contents: Option<&Contents>,
 ) -> Result<Box<dyn Learner>> {
     let info = client.info();
-    let worlds = Worlds {
+    let worlds = learners::Worlds {
         airspace: info.airspace().map_err(anyhow::Error::msg)?,
         n_observations: info.n_observations,
         n_moves: info.n_moves,
@@ -298,7 +294,7 @@ fn begin(
 }
 
 /// Returns the observations of the client's robots. Worlds whose episode has ended start their next episode first.
-fn running(client: &mut Client) -> Result<Vec<Observation>, ConnectionError> {
+fn running(client: &mut Client<impl Backend>) -> Result<Vec<Observation>, ConnectionError> {
     let mut observations = client.observe(client.robots())?;
     let over = ended(client, observations.iter());
     for (robot, seen) in reset(client, &over)? {
@@ -312,7 +308,10 @@ fn is_over(seen: &Observation) -> bool {
 }
 
 /// Returns the worlds whose episodes have ended, according to the observations of the client's robots.
-fn ended<'a>(client: &Client, observations: impl Iterator<Item = &'a Observation>) -> Vec<u32> {
+fn ended<'a>(
+    client: &Client<impl Backend>,
+    observations: impl Iterator<Item = &'a Observation>,
+) -> Vec<u32> {
     let robots = client.robots().zip(observations);
     let over = robots.filter(|(_, seen)| is_over(seen));
     let mut worlds: Vec<u32> = over
@@ -323,7 +322,10 @@ fn ended<'a>(client: &Client, observations: impl Iterator<Item = &'a Observation
 }
 
 /// Starts the next episode of some worlds. Returns the number and first observation of each of their robots.
-fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>, ConnectionError> {
+fn reset(
+    client: &mut Client<impl Backend>,
+    worlds: &[u32],
+) -> Result<Vec<(u32, Observation)>, ConnectionError> {
     if worlds.is_empty() {
         return Ok(Vec::new());
     }

@@ -2,15 +2,15 @@
 
 use crate::acting::mission::{check_recorded, needs_model, recorded_states};
 use crate::benchmark::team::Team;
-use crate::client::info::connect;
-use crate::client::truth::TruthFeed;
+use crate::client::worlds::Worlds;
 use anyhow::{Context, Result, ensure};
 use emberwatch_learning::policy::Policy;
 use emberwatch_learning::rollout::{Environment, Seen};
-use emberwatch_protocol::channels::Instance;
-use emberwatch_protocol::client::{Claim, Observation};
+use emberwatch_protocol::client::{Backend, Claim, Client, Observation};
 use emberwatch_protocol::control::{ServerInfo, WorldSeed};
-use emberwatch_protocol::{Client, Model, Move, Shape};
+use emberwatch_protocol::feed::Feed;
+use emberwatch_protocol::grid::Probabilities;
+use emberwatch_protocol::{Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
@@ -20,12 +20,9 @@ pub const MAX_BATCH: u32 = 32;
 /// Time to live of an unused lease on a comparison's worlds.
 const LEASE: Duration = Duration::from_secs(3600);
 
-/// Worlds of one server, leased for a comparison.
+/// Worlds on which policies are compared.
 pub struct Arena {
-    pub instance: Instance,
-    client: Client,
-    /// `None` if the server does not publish hidden states.
-    pub truth: Option<TruthFeed>,
+    client: Client<Worlds>,
     /// The worlds' model. For recorded worlds, a model whose states never change.
     pub model: Model,
     /// The model with which beliefs predict recorded worlds, if one was given.
@@ -42,9 +39,8 @@ pub struct Arena {
 
 impl Arena {
     /// Acquires up to `n_seeds` worlds.
-    pub fn open(instance: &Instance, n_seeds: u32) -> Result<Self> {
-        let connection = connect(instance)?;
-        let (n_worlds, team) = (connection.info().n_worlds, connection.info().n_robots);
+    pub fn open(worlds: Worlds, n_seeds: u32) -> Result<Self> {
+        let (n_worlds, team) = (worlds.info().n_worlds, worlds.info().n_robots);
         let n_worlds = n_worlds.min(n_seeds).min(MAX_BATCH);
         let claim = Claim {
             robots: 0..n_worlds * team,
@@ -53,26 +49,17 @@ impl Arena {
             // the lease at once.
             time_to_live: Some(LEASE),
         };
-        let client = Client::acquire(connection, &claim)?;
+        let client = Client::acquire(worlds, &claim)?;
         let info = client.info();
         let model = match recorded_states(info)? {
             None => info.model.as_deref().map(Model::from_toml).transpose()?,
             recorded => recorded,
         };
-        let model = model.with_context(|| {
-            format!(
-                "instance {:?}: comparing needs the model, for filters: start the server with --reveal-model true",
-                instance.name()
-            )
-        })?;
-        let truth = info
-            .publish_truth
-            .then(|| TruthFeed::open(instance, client.shape()));
-        let truth = truth.transpose()?;
+        let model = model.context(
+            "comparing needs the model, for filters: start the server with --reveal-model true",
+        )?;
         Ok(Self {
-            instance: instance.clone(),
             client,
-            truth,
             model,
             known: None,
             n_worlds,
@@ -100,6 +87,16 @@ impl Arena {
     /// Returns whether the worlds were recorded and no model was given for beliefs.
     pub fn lacks_model(&self) -> bool {
         self.info().recorded_world.is_some() && self.known.is_none()
+    }
+
+    /// Returns whether hidden states can be read.
+    pub fn has_truth(&mut self) -> bool {
+        self.client.backend().has_truth()
+    }
+
+    /// Opens the feed of beliefs to observers of these worlds.
+    pub fn feed(&mut self, belief: &Probabilities) -> Feed {
+        self.client.backend().feed(belief)
     }
 
     pub fn shape(&self) -> Shape {
@@ -154,12 +151,10 @@ impl Arena {
         0..self.seeds.len() as u32 * self.info().n_robots
     }
 
-    /// Returns what agents see at the present step, with the hidden states if they are published.
-    fn seen(&self, observations: Vec<Observation>) -> Result<Vec<Seen>> {
+    /// Returns what agents see at the present step, with the hidden states if they can be read.
+    fn seen(&mut self, observations: Vec<Observation>) -> Result<Vec<Seen>> {
         let n_worlds = self.seeds.len();
-        let truth = self.truth.as_ref();
-        let truth = truth.map(|truth| truth.states(0..n_worlds as u32, &self.seeds, self.step));
-        let truth = truth.transpose()?;
+        let truth = self.client.backend().states(&self.seeds, self.step)?;
         let mut observations = observations.into_iter();
         let agents = (0..n_worlds).flat_map(|world| vec![world; self.n_agents()]);
         let seen = agents.map(|world| Seen {

@@ -64,7 +64,7 @@ pub fn compare(
     let prior = first_belief(prior, arena.known_model(), arena.shape(), config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     let mut results = Results::default();
-    let mut feed = Feed::open(&arena.instance, prior.probabilities());
+    let mut feed = arena.feed(prior.probabilities());
     let contestants = comparison.contestants(&arena.model);
     // Before other policies run for hours, refuse any policy that cannot run.
     for (policy, _) in &contestants {
@@ -117,10 +117,10 @@ impl Comparison {
     }
 
     /// Checks that a policy can act in an arena.
-    fn check(&self, policy: &Policy, arena: &Arena) -> Result<()> {
+    fn check(&self, policy: &Policy, arena: &mut Arena) -> Result<()> {
         let needs_truth = policy.belief.input == Input::States || self.first_state_known;
         ensure!(
-            arena.truth.is_some() || !needs_truth,
+            arena.has_truth() || !needs_truth,
             "it needs the truth channel: start the server with --publish-truth"
         );
         arena.check_model(policy)?;

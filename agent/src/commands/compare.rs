@@ -1,7 +1,7 @@
 //! `compare`: runs policies on the same worlds, and reports their results.
 
 use super::shared::{asks_for_help, check_csv, make_folder, write};
-use super::worlds::WorldFlags;
+use super::worlds::{Source, WorldFlags};
 use crate::benchmark::arena::Arena;
 use crate::benchmark::compare::{Comparison, Results, compare};
 use crate::benchmark::report::common_worlds::check_worlds;
@@ -11,7 +11,6 @@ use crate::benchmark::report::{
     render_table, write_events,
 };
 use crate::benchmark::team::Team;
-use crate::client::launch::OwnDashboard;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -26,7 +25,7 @@ use emberwatch_network::DeviceKind;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::MAX_ROBOTS;
 use emberwatch_protocol::control::ServerInfo;
-use std::net::SocketAddr;
+use emberwatch_protocol::task::Task;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -51,8 +50,8 @@ pub struct CompareCommand {
     /// `exploit`; with teams: the first policy; on recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
-    /// Robots per world, separated by commas; each number is run separately [default: 1, or the running server's]
-    #[arg(long, conflicts_with = "task", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=MAX_ROBOTS as i64))]
+    /// Robots per world, separated by commas; each number is run separately [default: 1]
+    #[arg(long, conflicts_with_all = ["task", "instance"], value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=MAX_ROBOTS as i64))]
     robots: Vec<u32>,
     /// How the robots of a world act together: kinds of team, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "alone")]
@@ -73,9 +72,6 @@ pub struct CompareCommand {
     /// Draw ladder.svg, rewards.svg and teams.svg into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
-    /// Show the running comparison in a browser, at this address
-    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8600")]
-    watch: Option<SocketAddr>,
     /// Write the reward of each step for TensorBoard into this directory, with one run per policy
     #[arg(long, value_name = "DIR")]
     tensorboard: Option<PathBuf>,
@@ -107,24 +103,24 @@ impl CompareCommand {
             robots => robots.iter().copied().map(Some).collect(),
         };
         let added = self.read_added()?;
+        // Errors in settings and policies come before any run.
+        let sources = numbers.into_iter().map(|number| self.worlds.source(number));
+        let sources = sources.collect::<Result<Vec<Source>>>()?;
+        for source in &sources {
+            let has_teams = self.has_teams(source.task());
+            let checked = source.model().map(|it| self.policies(it, &learned, has_teams));
+            checked.transpose()?;
+        }
         let mut report = Report::default();
-        for n_robots in numbers {
-            let mut worlds = self
-                .worlds
-                .open(n_robots, |model| self.policies(model, &learned).map(|_| ()))?;
-            let arena = &mut worlds.arena;
-            let dashboard = self
-                .watch
-                .map(|address| OwnDashboard::start(&arena.instance, address))
-                .transpose()?;
-            if let Some(dashboard) = &dashboard {
-                tracing::info!("watch at {}", dashboard.url());
-            }
+        for source in sources {
+            let (seeds, task) = (self.worlds.seeds(&source), source.task().cloned());
+            let has_teams = self.has_teams(task.as_ref());
+            let arena = &mut source.open((seeds.end - seeds.start) as u32)?;
             let comparison = Comparison {
-                policies: self.policies_on(arena, &learned)?,
+                policies: self.policies_on(arena, &learned, has_teams)?,
                 teams: self.team.clone(),
-                seeds: self.worlds.seeds(),
-                steps: self.worlds.steps(arena.info())?,
+                seeds,
+                steps: self.worlds.steps(task.as_ref(), arena.info())?,
                 recent_steps: self.recent_steps,
                 config: config.clone(),
                 learned: learned.clone(),
@@ -133,7 +129,8 @@ impl CompareCommand {
             self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
             let policies = &comparison.policies;
-            report.baseline = self.baseline(&arena.model, arena.lacks_model(), policies)?;
+            report.baseline =
+                self.baseline(&arena.model, arena.lacks_model(), policies, has_teams)?;
             report.axis_label = axis_label(&arena.model);
             report.fire_cells = results.fire_cells;
             report.runs.extend(results.runs);
@@ -217,9 +214,14 @@ impl CompareCommand {
 
     /// Returns the policies to run in an arena. If the arena has no model, the ladder keeps only policies that need
     /// none.
-    fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
-        let mut policies = self.policies(&arena.model, learned)?;
-        if arena.lacks_model() && self.policies.is_empty() && !self.has_teams() {
+    fn policies_on(
+        &self,
+        arena: &Arena,
+        learned: &Learned,
+        has_teams: bool,
+    ) -> Result<Vec<Policy>> {
+        let mut policies = self.policies(&arena.model, learned, has_teams)?;
+        if arena.lacks_model() && self.policies.is_empty() && !has_teams {
             policies.retain(|policy| !policy.belief.knows_model);
         }
         Ok(policies)
@@ -234,7 +236,7 @@ impl CompareCommand {
         checked.context("--baseline")
     }
 
-    fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
+    fn policies(&self, model: &Model, learned: &Learned, has_teams: bool) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
         let with_options = |name: &String| {
             if name == OPTIONS {
@@ -244,7 +246,7 @@ impl CompareCommand {
             }
         };
         let policies = match self.policies.as_slice() {
-            [] if self.has_teams() => vec![named(&TEAM_POLICY.to_owned())?],
+            [] if has_teams => vec![named(&TEAM_POLICY.to_owned())?],
             [] => ladder(model, learned),
             names => {
                 let policies = names.iter().map(with_options);
@@ -260,7 +262,7 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        self.baseline(model, false, &policies)?;
+        self.baseline(model, false, &policies, has_teams)?;
         policies
             .iter()
             .try_for_each(|policy| policy.check(learned))?;
@@ -268,14 +270,20 @@ impl CompareCommand {
     }
 
     /// Returns whether worlds have several robots, or `--team` names other kinds than `alone`.
-    fn has_teams(&self) -> bool {
-        let of_task = self.worlds.task().map(|task| task.robots);
+    fn has_teams(&self, task: Option<&Task>) -> bool {
+        let of_task = task.map(|task| task.robots);
         let mut robots = self.robots.iter().copied().chain(of_task);
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 
     /// Returns the name of the baseline: `--baseline`, or the default for options, teams or the ladder.
-    fn baseline(&self, model: &Model, lacks_model: bool, policies: &[Policy]) -> Result<String> {
+    fn baseline(
+        &self,
+        model: &Model,
+        lacks_model: bool,
+        policies: &[Policy],
+        has_teams: bool,
+    ) -> Result<String> {
         if let Some(name) = &self.baseline {
             return Ok(Policy::named(name, model).context("--baseline")?.name);
         }
@@ -283,7 +291,7 @@ impl CompareCommand {
         let found = if self.policies.iter().any(|name| name == OPTIONS) {
             policies.find(|policy| matches!(policy.goal, Goal::Option(_)))
         } else {
-            policies.next().filter(|_| self.has_teams())
+            policies.next().filter(|_| has_teams)
         };
         let default = if lacks_model {
             "coverage"

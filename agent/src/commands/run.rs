@@ -1,8 +1,9 @@
 //! `run`: acts on one world of a running server.
 
-use super::shared::{WaitFlag, model_named, model_of, parse_range};
+use super::shared::{parse_range, parse_seconds};
 use crate::acting::mission::{Cooperation, Mission};
 use crate::acting::run::run;
+use crate::client::info::wait_for_server;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result};
 use clap::Args;
@@ -14,6 +15,7 @@ use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_protocol::task::Task;
+use emberwatch_sim::config::{ServerConfig, model_named};
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
@@ -25,11 +27,12 @@ pub struct RunCommand {
     /// Instance name of the server
     #[arg(long, default_value = "default")]
     instance: String,
-    #[command(flatten)]
-    wait: WaitFlag,
-    #[arg(long, value_name = "NAME|FILE", value_parser = Task::named, help = format!(
+    /// Maximum seconds to wait for the instance's server; 0: do not wait
+    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
+    wait: Duration,
+    #[arg(long, value_name = "NAME|FILE", help = format!(
         "Refuse the server unless it has this task: {}, or a task file", listed(Task::built_in_names())))]
-    task: Option<Task>,
+    task: Option<String>,
     /// Number of the world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
@@ -81,7 +84,7 @@ impl RunCommand {
         }?;
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
-            task: self.task.clone().map(task_with_model).transpose()?,
+            task: self.task.as_ref().map(task_with_model).transpose()?,
             world: self.world,
             robots: self
                 .robots
@@ -103,10 +106,7 @@ impl RunCommand {
             learned: learners::read(self.checkpoint.as_deref(), &self.device.open()?)?,
         };
         let stop = stop_on_signals().context("handle signals")?;
-        if !self
-            .wait
-            .for_server(&mission.instance, || stop.load(Relaxed))?
-        {
+        if !wait_for_server(&mission.instance, self.wait, || stop.load(Relaxed))? {
             return Ok(());
         }
         let summary = run(&mission, &stop)?;
@@ -116,9 +116,16 @@ impl RunCommand {
     }
 }
 
-fn task_with_model(task: Task) -> Result<(Task, Option<Model>)> {
-    let model = (!task.is_recorded()).then(|| model_of(&task));
-    Ok((task, model.transpose()?))
+/// Returns the task, with its model unless the task is recorded.
+fn task_with_model(task: &String) -> Result<(Task, Option<Model>)> {
+    let settings = ServerConfig {
+        task: task.clone(),
+        ..ServerConfig::default()
+    };
+    let settings = settings.check()?;
+    let model = settings.recorded.is_none().then_some(settings.model);
+    let task = settings.task.context("invariant: a task was given")?;
+    Ok((task, model))
 }
 
 /// Parses a rate of at least 1 step per second. Observers would take a slower agent for dead, and a slower agent would

@@ -1,34 +1,13 @@
-//! Helpers of several subcommands: waiting for a server, models by name, output files.
+//! Helpers of several subcommands: values of flags, and output files.
 
 use crate::benchmark::report::runs_file::check_runs_file;
-use crate::client::info::wait_for_server;
-use anyhow::{Context, Result, ensure};
-use clap::Args;
+use anyhow::{Context, Result};
 use emberwatch_learning::file::check_replaceable;
-use emberwatch_protocol::Model;
-use emberwatch_protocol::built_in::listed;
-use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::print;
-use emberwatch_protocol::task::Task;
 use std::ops::Range;
 use std::path::Path;
 use std::str::FromStr;
 use std::time::Duration;
-
-/// The flag `--wait`.
-#[derive(Debug, Args)]
-pub struct WaitFlag {
-    /// Maximum seconds to wait for the instance's server; 0: do not wait
-    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
-    wait: Duration,
-}
-
-impl WaitFlag {
-    /// Waits for the instance's server. Returns false if `is_over` returned true first.
-    pub fn for_server(&self, instance: &Instance, is_over: impl Fn() -> bool) -> Result<bool> {
-        Ok(wait_for_server(instance, self.wait, is_over)?)
-    }
-}
 
 /// Returns whether `--policies help` asks for the list of policies.
 pub fn asks_for_help(policies: &[String]) -> bool {
@@ -52,37 +31,6 @@ pub fn parse_range<T: FromStr + PartialOrd>(text: &str) -> Result<Range<T>, Stri
     } else {
         Ok(range)
     }
-}
-
-/// Returns a built-in model, or reads a model file.
-pub fn model_named(name: &str) -> Result<Model> {
-    if let Some(model) = Model::built_in(name) {
-        return Ok(model);
-    }
-    let path = Path::new(name);
-    ensure!(
-        path.exists(),
-        "model file {name}: No such file: expected a model file, or one of {}",
-        listed(Model::built_in_names())
-    );
-    read_model(path)
-}
-
-/// Returns the model of a task with simulated worlds, with the task's sensor.
-pub fn model_of(task: &Task) -> Result<Model> {
-    with_sensor(model_named(&task.model)?, task.radius())
-}
-
-/// Returns a model whose robots see `radius` rows and columns beyond their path; `None` keeps the model's radius.
-pub fn with_sensor(model: Model, radius: Option<usize>) -> Result<Model> {
-    Ok(match radius {
-        Some(radius) => model.with_radius(radius)?,
-        None => model,
-    })
-}
-
-pub fn read_model(path: &Path) -> Result<Model> {
-    Model::read(path).with_context(|| format!("model file {}", path.display()))
 }
 
 /// Creates a folder for output files, and checks that it is writable.

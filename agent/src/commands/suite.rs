@@ -12,8 +12,7 @@ use crate::benchmark::report::common_worlds::{World, check_worlds};
 use crate::benchmark::report::runs_file::{csv_files, file_of, read_tasks, write_runs};
 use crate::benchmark::report::suite::{CEILING, FLOOR, render_suite};
 use crate::benchmark::team::Team;
-use crate::client::errors::is_outage;
-use crate::client::launch::OwnServer;
+use crate::client::worlds::Worlds;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -23,8 +22,11 @@ use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::{self, Policy};
 use emberwatch_protocol::task::Task;
+use emberwatch_sim::config::{Checked, ServerConfig};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::copy;
 use std::ops::Range;
 use std::path::PathBuf;
 
@@ -32,8 +34,8 @@ use std::path::PathBuf;
 #[derive(Args)]
 pub struct SuiteCommand {
     /// Tasks, separated by commas, as names or task files
-    #[arg(long, value_delimiter = ',', value_parser = Task::named, default_values = Task::built_in_names())]
-    tasks: Vec<Task>,
+    #[arg(long, value_delimiter = ',', default_values = Task::built_in_names())]
+    tasks: Vec<String>,
     /// Policies, separated by commas (`help` lists them); random_walk (score 0) and oracle_ahead (score 1) always run
     #[arg(
         long,
@@ -50,16 +52,13 @@ pub struct SuiteCommand {
     /// World steps of each training, summed over its worlds [default: from the settings]
     #[arg(long, value_name = "STEPS", requires = "train", value_parser = clap::value_parser!(u64).range(1..))]
     train_steps: Option<u64>,
-    /// Folder for results, with one CSV file per task and policy; a file is kept unless the programs, the checkpoint, the
+    /// Folder for results, with one CSV file per task and policy; a file is kept unless the program, the checkpoint, the
     /// settings or the task's worlds have changed
     #[arg(long, value_name = "FOLDER", default_value = "suite")]
     out: PathBuf,
     /// Number of worlds per task, from the first test seed on [default: all]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     worlds: Option<u64>,
-    /// Path of emberwatch-server [default: in the folder of this program, or on PATH]
-    #[arg(long, value_name = "PROGRAM")]
-    server: Option<PathBuf>,
     #[command(flatten)]
     settings: AgentFlags,
 }
@@ -84,31 +83,31 @@ impl SuiteCommand {
             );
         }
         // Errors in policies and worlds come before any run.
-        let (mut plans, mut runs) = (Vec::<Plan<'_>>::new(), Vec::new());
+        let (mut plans, mut runs) = (Vec::new(), Vec::new());
+        let build = build()?;
         for task in &self.tasks {
-            let build = plans.first().map(|plan| plan.build.clone());
-            let plan = self.plan(task, &config, build);
-            plans.push(plan.with_context(|| format!("task {}", task.name))?);
+            let settings = ServerConfig {
+                task: task.clone(),
+                ..ServerConfig::default()
+            };
+            let plan = self.plan(settings.check()?, &config, &build);
+            plans.push(plan.with_context(|| format!("task {task}"))?);
         }
         for plan in &plans {
             let own = self.carry_out(plan);
-            runs.extend(own.with_context(|| format!("task {}", plan.task.name))?);
+            runs.extend(own.with_context(|| format!("task {}", plan.task().name))?);
         }
         write(&render_suite(&runs))
     }
 
-    /// Returns the plan for a task, and reads the rows in its folder. `build` is the digest of the programs, if known.
-    fn plan<'a>(
-        &self,
-        task: &'a Task,
-        config: &AgentConfig,
-        build: Option<String>,
-    ) -> Result<Plan<'a>> {
+    /// Returns the plan for a task, and reads the rows in its folder. `build` is the digest of the program.
+    fn plan(&self, settings: Checked, config: &AgentConfig, build: &str) -> Result<Plan> {
+        let task = settings.task.as_ref().expect("invariant: it has a task");
         let mut seeds = task.test_seeds.clone();
         if let Some(n) = self.worlds {
             seeds.end = seeds.end.min(seeds.start.saturating_add(n));
         }
-        let (arena, server) = self.open(task, &seeds, 1)?;
+        let arena = open(settings.clone(), &seeds, 1)?;
         let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
         ensure!(
             task.max_steps <= longest,
@@ -142,11 +141,11 @@ impl SuiteCommand {
             found.extend(runs.into_iter().map(|run| (file.clone(), run)));
         }
         Ok(Plan {
-            task,
             worlds: comparison.worlds(arena.info()),
             comparison,
             form: WorldForm::of(&arena.model, arena.shape()),
-            build: build.map_or_else(|| server.build(), Ok)?,
+            build: build.into(),
+            settings,
             folder,
             found,
         })
@@ -155,8 +154,8 @@ impl SuiteCommand {
     /// Trains what the policies of a task need, then runs each policy whose rows are missing or outdated. Returns all
     /// rows, including those of other programs. Warns about policies that cannot run or were measured on other worlds,
     /// and leaves them out.
-    fn carry_out(&self, plan: &Plan<'_>) -> Result<Vec<PolicyRun>> {
-        let (task, mut runs, mut missing) = (&plan.task.name, Vec::new(), Vec::new());
+    fn carry_out(&self, plan: &Plan) -> Result<Vec<PolicyRun>> {
+        let (task, mut runs, mut missing) = (&plan.task().name, Vec::new(), Vec::new());
         for policy in plan.others() {
             let is_others =
                 |run: &&PolicyRun| run.policy == policy && run.policy_fingerprint.is_empty();
@@ -170,7 +169,6 @@ impl SuiteCommand {
             let name = &policy.name;
             let trained = match self.prepare(plan, policy) {
                 Ok(trained) => trained,
-                Err(reason) if is_outage(&reason) => return Err(reason),
                 Err(reason) => {
                     tracing::warn!("task {task}: {name} is not run: {reason:#}");
                     continue;
@@ -192,11 +190,7 @@ impl SuiteCommand {
             return Ok(runs);
         }
         let n_worlds = plan.worlds.len() as u32;
-        let (mut arena, server) = self.open(plan.task, &plan.comparison.seeds, n_worlds)?;
-        ensure!(
-            plan.comparison.worlds(arena.info()) == plan.worlds && server.build()? == plan.build,
-            "the programs or the task's files have changed since the command began: run it again"
-        );
+        let mut arena = open(plan.settings.clone(), &plan.comparison.seeds, n_worlds)?;
         for (policy, trained, fingerprint) in missing {
             let comparison = Comparison {
                 policies: vec![policy.clone()],
@@ -216,9 +210,9 @@ impl SuiteCommand {
     }
 
     /// Reads a policy's checkpoints. With `--train`, first runs the missing trainings.
-    fn prepare(&self, plan: &Plan<'_>, policy: &Policy) -> Result<Trained> {
+    fn prepare(&self, plan: &Plan, policy: &Policy) -> Result<Trained> {
         ensure!(
-            !(plan.task.is_recorded() && policy.belief.knows_model),
+            !(plan.task().is_recorded() && policy.belief.knows_model),
             "it needs a known model, and recorded worlds have none"
         );
         let is_own =
@@ -234,43 +228,53 @@ impl SuiteCommand {
         );
         let folder = self.checkpoints.clone().unwrap_or_default();
         let trainings = Trainings {
-            folder: folder.join(&plan.task.name),
-            task: plan.task,
-            worlds_fingerprint: &plan.worlds[0].2,
+            folder: folder.join(&plan.task().name),
+            settings: &plan.settings,
             policy,
             config: &plan.comparison.config,
             steps: self.train_steps,
-            server: &self.server,
         };
         trainings.complete(self.train, &plan.form)
     }
+}
 
-    /// Starts a server with a task's worlds, and opens them. Dropping the server stops it.
-    fn open(&self, task: &Task, seeds: &Range<u64>, n_worlds: u32) -> Result<(Arena, OwnServer)> {
-        let (worlds, seed) = (n_worlds.min(MAX_BATCH).to_string(), seeds.start.to_string());
-        let task = ["--task", &task.source, "--worlds", &worlds, "--seed", &seed];
-        let mut flags: Vec<String> = task.map(String::from).into();
-        flags.push("--publish-truth".into());
-        let server = OwnServer::start(self.server.clone(), &flags)?;
-        Ok((Arena::open(server.instance(), n_worlds)?, server))
-    }
+/// Simulates worlds of a task, and acquires them.
+fn open(mut settings: Checked, seeds: &Range<u64>, n_worlds: u32) -> Result<Arena> {
+    settings.config.seed = seeds.start;
+    let settings = settings.with_worlds(n_worlds.min(MAX_BATCH))?;
+    Arena::open(Worlds::simulate(settings)?, n_worlds)
+}
+
+/// Returns a digest of the running program. A program that is built anew from changed files has another digest, even
+/// if its file has been replaced since the start.
+fn build() -> Result<String> {
+    let (path, mut hash) = ("/proc/self/exe", Sha256::new());
+    let read = File::open(path).and_then(|mut file| copy(&mut file, &mut hash));
+    read.with_context(|| format!("read {path}"))?;
+    Ok(format!("{:x}", hash.finalize()))
 }
 
 /// The policies and worlds of one task of a suite, and the rows that its folder had at the start.
-struct Plan<'a> {
-    task: &'a Task,
+struct Plan {
+    /// Settings of the task's worlds.
+    settings: Checked,
     worlds: Vec<World>,
     /// The comparison of all policies, without checkpoints.
     comparison: Comparison,
     form: WorldForm,
-    /// Digest of the programs.
+    /// Digest of the program.
     build: String,
     folder: PathBuf,
     /// The rows of all files, each with its file.
     found: Vec<(PathBuf, PolicyRun)>,
 }
 
-impl Plan<'_> {
+impl Plan {
+    fn task(&self) -> &Task {
+        let task = self.settings.task.as_ref();
+        task.expect("invariant: a suite's settings have a task")
+    }
+
     /// Returns 16 hexadecimal digits that identify all that a policy's actions depend on, except its name and worlds.
     fn fingerprint(&self, learned: &Learned) -> String {
         let Comparison { teams, config, .. } = &self.comparison;

@@ -1,9 +1,9 @@
 //! `train`: trains a learner while it acts.
 
-use super::shared::{WaitFlag, make_folder, parse_seconds};
-use super::worlds::GridFlags;
+use super::shared::{make_folder, parse_seconds};
+use super::worlds::{BURN_IN, SimulationFlags};
 use crate::benchmark::report::training::draw_training;
-use crate::client::launch::OwnServer;
+use crate::client::worlds::Worlds;
 use crate::flags::{AgentFlags, Preset, one_of, one_of_names};
 use crate::training::{CHECKPOINT, TrainingSpec, train};
 use anyhow::{Context, Result, ensure};
@@ -17,8 +17,10 @@ use emberwatch_learning::learners::filter::FILTER;
 use emberwatch_learning::learners::{self, LEARNERS, LearnerKind};
 use emberwatch_network::{Device, DeviceKind};
 use emberwatch_protocol::channels::{Instance, MAX_WORLDS};
+use emberwatch_protocol::control::CoverageRule;
 use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_protocol::task::FIRST_TRAINING_SEED;
+use emberwatch_sim::config::{Checked, ServerConfig};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
@@ -37,16 +39,14 @@ const COVERAGES: [(bool, &str, &str); 2] = [
     ),
 ];
 
-/// Learn a model while acting on a server's worlds.
+/// Learn a model while acting.
 #[derive(Args)]
 pub struct TrainCommand {
-    /// Train on this running server; without it, the command starts a server and stops it at the end
-    #[arg(long)]
+    /// Train on this running server, instead of simulating worlds
+    #[arg(long, conflicts_with = "SimulationFlags")]
     instance: Option<String>,
-    #[command(flatten)]
-    wait: WaitFlag,
-    /// Number of the first world to act on
-    #[arg(long, default_value_t = 0)]
+    /// Number of the server's first world to act on
+    #[arg(long, default_value_t = 0, requires = "instance")]
     world: u32,
     /// Number of worlds to act on at once [default: 16; with --learner autoencoder: 1]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MAX_WORLDS as i64))]
@@ -84,19 +84,13 @@ pub struct TrainCommand {
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
     /// Take the worlds over from the client that holds them
-    #[arg(long)]
+    #[arg(long, requires = "instance")]
     takeover: bool,
-    /// Path of emberwatch-server [default: in the folder of this program, or on PATH]
-    #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
-    server: Option<PathBuf>,
-    /// Seed of the started server's first world
+    /// Seed of the first world
     #[arg(long, default_value_t = FIRST_TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
-    /// Burn-in of the started server, in steps [default: 25000; with --preset paper: 0]
-    #[arg(long, conflicts_with_all = ["instance", "states", "task"])]
-    burn_in: Option<u64>,
     #[command(flatten)]
-    grid: GridFlags,
+    simulation: SimulationFlags,
     #[command(flatten)]
     settings: AgentFlags,
 }
@@ -106,14 +100,11 @@ impl TrainCommand {
         let stop = stop_on_signals().context("handle signals")?;
         let mut training = self.training()?;
         let contents = self.contents(&mut training)?;
-        let (instance, own) = self.server(&training)?;
-        if own.is_none() && !self.wait.for_server(&instance, || stop.load(Relaxed))? {
-            return Ok(());
-        }
+        let mut worlds = self.worlds(&training)?;
         let end = |limit| Instant::now().checked_add(limit);
         training.deadline = self.time_limit.and_then(end);
         if contents.is_none() && needs_belief(&training)? {
-            learn_belief(&instance, &training, &stop)?;
+            learn_belief(&mut worlds, &training, &stop)?;
             if stop.load(Relaxed) {
                 return Ok(());
             }
@@ -121,7 +112,7 @@ impl TrainCommand {
             training.learned = learners::read([&*belief], &training.device)?;
             training.resume = false;
         }
-        learn(&instance, &training, contents, &stop).map(drop)
+        learn(&mut worlds, &training, contents, &stop).map(drop)
     }
 
     fn training(&self) -> Result<TrainingSpec> {
@@ -279,50 +270,31 @@ impl TrainCommand {
         Ok(())
     }
 
-    /// Returns the instance to train on, and the server if this call started it. Dropping the returned server stops it.
-    fn server(&self, training: &TrainingSpec) -> Result<(Instance, Option<OwnServer>)> {
+    /// Attaches to the server, or starts to simulate worlds.
+    fn worlds(&self, training: &TrainingSpec) -> Result<Worlds> {
         if let Some(name) = &self.instance {
-            return Ok((Instance::new(name)?, None));
+            return Worlds::attach(&Instance::new(name)?, false);
         }
-        let of_states = self.grid.model_of_states()?;
-        ensure!(
-            of_states.is_none(),
-            "--model cannot be used with --states: training on recorded states uses no model"
-        );
-        self.grid.check()?;
-        ensure!(
-            self.world == 0,
-            "--world: expected 0 on a server that the command starts, got {}",
-            self.world
-        );
-        let burn_in = self.burn_in.unwrap_or(match self.settings.preset {
-            Preset::Default => 25_000,
-            Preset::Paper => 0,
-        });
-        let n_worlds = training.worlds.len() as u32;
-        let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
-        let episode_steps = (training.learner()?.episode_steps)(&training.config);
-        // A task already determines the episode length.
-        let episode_steps = episode_steps.filter(|_| self.grid.task.is_none());
-        let episode = episode_steps.map(|steps| ["--max-steps".into(), steps.to_string()]);
-        arguments.extend(episode.into_iter().flatten());
-        let server = start_server(self.server.clone(), arguments, training)?;
-        Ok((server.instance().clone(), Some(server)))
+        let default = ServerConfig {
+            seed: self.seed,
+            burn_in: match self.settings.preset {
+                Preset::Default => BURN_IN,
+                Preset::Paper => 0,
+            },
+            max_steps: (training.learner()?.episode_steps)(&training.config).unwrap_or(0),
+            ..ServerConfig::default()
+        };
+        simulate(self.simulation.check(&default)?, training)
     }
 }
 
-/// Starts a server for a training. Dropping the returned value stops the server.
-pub(super) fn start_server(
-    program: Option<PathBuf>,
-    mut arguments: Vec<String>,
-    training: &TrainingSpec,
-) -> Result<OwnServer> {
+/// Starts to simulate worlds for a training.
+pub(super) fn simulate(mut settings: Checked, training: &TrainingSpec) -> Result<Worlds> {
     // A learner that learns a model must not see the true model.
     let reveals = decides(training.learner()?) && training.belief()?.knows_model;
-    let reveals = reveals.to_string();
-    let rest = ["--reveal-model", &reveals, "--coverage", "client"];
-    arguments.extend(rest.map(String::from));
-    OwnServer::start(program, &arguments)
+    settings.config.reveal_model = reveals;
+    settings.config.coverage = CoverageRule::Client;
+    Worlds::simulate(settings.with_worlds(training.worlds.len() as u32)?)
 }
 
 fn decides(kind: &LearnerKind) -> bool {
@@ -335,12 +307,12 @@ fn needs_belief(training: &TrainingSpec) -> Result<bool> {
 }
 
 /// Trains the belief that decisions are based on, unless its training is complete.
-fn learn_belief(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
+fn learn_belief(worlds: &mut Worlds, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
     let Some(belief) = training.belief_training()? else {
         return Ok(());
     };
     make_folder(&belief.out)?;
-    let n_steps = learn(instance, &belief, belief.check()?, stop)?;
+    let n_steps = learn(worlds, &belief, belief.check()?, stop)?;
     ensure!(
         n_steps >= belief.steps || stop.load(Relaxed),
         "--time-limit: the time ended before the belief was learned: continue with --resume"
@@ -350,14 +322,14 @@ fn learn_belief(instance: &Instance, training: &TrainingSpec, stop: &AtomicBool)
 
 /// Trains, logs a summary, draws the metrics, and returns the number of world steps.
 pub(super) fn learn(
-    instance: &Instance,
+    worlds: &mut Worlds,
     training: &TrainingSpec,
     contents: Option<Contents>,
     stop: &AtomicBool,
 ) -> Result<u64> {
     let learner = &training.config.learner;
     tracing::info!(learner, steps = training.steps, out = %training.out.display(), "learning");
-    let summary = train(instance, training, contents, stop)?;
+    let summary = train(worlds, training, contents, stop)?;
     let mean_reward = summary.reward / summary.steps.max(1) as f64;
     tracing::info!(
         steps = summary.steps,

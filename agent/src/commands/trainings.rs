@@ -4,7 +4,7 @@
 //! `decisions-BELIEF` for decisions on a belief.
 
 use super::shared::make_folder;
-use super::train::{N_WORLDS, learn, start_server};
+use super::train::{N_WORLDS, learn, simulate};
 use crate::training::{CHECKPOINT, TrainingSpec, seconds};
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_learning::beliefs::WorldForm;
@@ -16,7 +16,8 @@ use emberwatch_learning::learners::filter::FILTER;
 use emberwatch_learning::policy::Policy;
 use emberwatch_learning::rollout::building;
 use emberwatch_network::Device;
-use emberwatch_protocol::task::{FIRST_TRAINING_SEED, Task};
+use emberwatch_protocol::task::FIRST_TRAINING_SEED;
+use emberwatch_sim::config::Checked;
 use std::fs::rename;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -25,14 +26,12 @@ use std::sync::atomic::AtomicBool;
 pub struct Trainings<'a> {
     /// The task's folder.
     pub folder: PathBuf,
-    pub task: &'a Task,
-    /// Identifies the worlds that the task's files defined when the command began.
-    pub worlds_fingerprint: &'a str,
+    /// Settings of the task's worlds.
+    pub settings: &'a Checked,
     pub policy: &'a Policy,
     pub config: &'a AgentConfig,
     /// World steps of each training, summed over its worlds; `None`: the number in the settings.
     pub steps: Option<u64>,
-    pub server: &'a Option<PathBuf>,
 }
 
 /// What a policy's trainings produced: its checkpoints and their training time.
@@ -46,8 +45,8 @@ impl Trainings<'_> {
     /// Reads the checkpoints. If `trains`, first runs the trainings that have none.
     ///
     /// # Errors
-    /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, if a
-    /// learner cannot learn in the task's worlds, or if the task's files have changed.
+    /// If a checkpoint is missing or cannot be used, if decisions were not learned on the belief next to them, or if a
+    /// learner cannot learn in the task's worlds.
     pub fn complete(&self, trains: bool, world: &WorldForm) -> Result<Trained> {
         let (mut folders, mut seconds) = (Vec::new(), Some(0.0));
         let all: Vec<(&str, PathBuf)> = self.folders().collect();
@@ -59,8 +58,8 @@ impl Trainings<'_> {
                     let (other, folder) = (other.display(), folder.display());
                     bail!("{other} is in the way of the training for {folder}: remove it");
                 }
-                let (task, policy) = (&self.task.name, &self.policy.name);
-                tracing::info!("task {task}: training {learner} for {policy}");
+                let policy = &self.policy.name;
+                tracing::info!("training {learner} for {policy}");
                 let trained = self.train(learner, read(&folders)?, folder);
                 trained.with_context(|| format!("train --learner {learner}"))?;
             }
@@ -112,25 +111,11 @@ impl Trainings<'_> {
             config,
             learned,
         };
-        let (worlds, seed) = (
-            spec.worlds.len().to_string(),
-            FIRST_TRAINING_SEED.to_string(),
-        );
-        let flags = [
-            "--task",
-            &self.task.source,
-            "--worlds",
-            &worlds,
-            "--seed",
-            &seed,
-        ];
-        let server = start_server(self.server.clone(), flags.map(String::from).into(), &spec)?;
-        ensure!(
-            server.worlds_fingerprint() == self.worlds_fingerprint,
-            "the task's files have changed since the command began: run it again"
-        );
+        let mut settings = self.settings.clone();
+        settings.config.seed = FIRST_TRAINING_SEED;
+        let mut worlds = simulate(settings, &spec)?;
         make_folder(&spec.out)?;
-        learn(server.instance(), &spec, None, &AtomicBool::new(false))?;
+        learn(&mut worlds, &spec, None, &AtomicBool::new(false))?;
         rename(&spec.out, folder).with_context(|| format!("rename to {}", folder.display()))
     }
 }

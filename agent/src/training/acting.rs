@@ -5,7 +5,8 @@ use anyhow::Result;
 use emberwatch_learning::learners::{Learner, LearnerKind};
 use emberwatch_learning::rollout::{Actor, Seen, StepRecord};
 use emberwatch_protocol::feed::Feed;
-use emberwatch_protocol::{Client, Move};
+use emberwatch_protocol::Move;
+use emberwatch_protocol::client::{Backend, Client};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -26,7 +27,7 @@ impl<'a> Acting<'a> {
         learner: &'a mut dyn Learner,
         kind: &'static LearnerKind,
         feed: &'a mut Feed,
-        client: &Client,
+        client: &Client<impl Backend>,
     ) -> Self {
         Self {
             learner,

@@ -42,3 +42,23 @@ pub trait Backend {
         serde_json::from_slice(&answer).map_err(|error| garbled("a control request", error))
     }
 }
+
+/// Whoever holds a backend can lend it to a client, and use it again afterwards.
+impl<B: Backend> Backend for &mut B {
+    fn info(&self) -> &ServerInfo {
+        (**self).info()
+    }
+
+    fn step(
+        &mut self,
+        request: StepRequest,
+        body: &[u8],
+        timeout: Duration,
+    ) -> Result<StepAnswer, ConnectionError> {
+        (**self).step(request, body, timeout)
+    }
+
+    fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError> {
+        (**self).control_text(text, timeout)
+    }
+}

@@ -55,6 +55,14 @@ impl Feed {
         }
     }
 
+    /// Returns a feed without readers.
+    pub fn closed() -> Self {
+        Self {
+            publisher: None,
+            turns: Turns::default(),
+        }
+    }
+
     /// Returns whether a belief is due and there are readers.
     pub fn is_due(&self) -> bool {
         !self.due(1).is_empty()
