@@ -43,10 +43,9 @@ run --wait soon => --wait | expected a number of seconds
 run --instance a/b => instance name | "a/b"
 run --steps -1 => -1
 run --steps-per-second 0.5 => --steps-per-second | expected 1 or more steps per second, got "0.5"
-run --robots 0..2 => --team
-run --team --robots 3..3 => --robots | FIRST below END
-run --team --share => --share | --team
-run --robot 1 --robots 0..2 --team => '--robot <ROBOT>' cannot be used with '--robots
+run --robots 3..3 => --robots | FIRST below END
+run --robots some => --robots | expected FIRST..END
+run --team oracle => --team: expected alone, shared or joint, got oracle
 run --model no.toml => model file no.toml | No such file | expected a file, or one of | wildfire, wildfire-burnout
 run --checkpoint /dev/zero => checkpoint /dev/zero: expected a regular file
 run --config no.toml => config file no.toml | No such file
@@ -129,7 +128,7 @@ run SERVER => does not reveal its model | --model FILE",
         ),
         (
             "--publish-truth",
-            "run SERVER --robot 1 => robots: expected a part of the world's robots 0..1, got 1..2
+            "run SERVER --robots 0..2 => robots: expected a part of the world's robots 0..1, got 0..2
 run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\"",
         ),
         (

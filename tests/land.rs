@@ -128,7 +128,7 @@ fn snapshots_and_agents_of_a_land_go_on() {
         "oracle_ahead",
     ] {
         agent(&format!(
-            "run {} --policy {policy} --steps 3 --team",
+            "run {} --policy {policy} --steps 3 --team joint",
             on(&again)
         ));
     }

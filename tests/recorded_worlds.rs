@@ -303,7 +303,7 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
         check(AGENT, &format!("{compare} {flags}"), words);
     }
     let states = format!("--states {}", place.folder.word(""));
-    let table = "train STATES --model wildfire --out x => --model cannot be used with --states
+    let table = "train STATES --model wildfire --out x => model: expected to be left out, as the states file decides it
 compare STATES --height 3 => --states <NAME|FILE|FOLDER> | cannot be used with | --height
 train STATES --out x --burn-in 3 => --states <NAME|FILE|FOLDER> | cannot be used with | --burn-in";
     check_table(AGENT, &table.replace("STATES", &states));

@@ -155,7 +155,7 @@ fn rows_of_other_worlds_are_run_again_left_out_or_refused() {
     kept.check_says("coverage.csv has rows of another policy or program: move the file");
     assert_eq!(place.0.text("out/tiny/coverage.csv"), rows);
     place.0.write("out/tiny/python.csv", "policy\nmine\n");
-    let words = "task tiny: | out/tiny/python.csv: expected a CSV file";
+    let words = "tiny.toml: | out/tiny/python.csv: expected a CSV file";
     check(AGENT, &place.words(""), words);
 }
 
@@ -224,7 +224,7 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
 fn wrong_suites_and_entries_are_named_before_anything_runs() {
     let place = Place::new();
     let table = "suite --tasks ash => task ash: No such file | expected a file, or one of wildfire, small
-suite --tasks TINY,jacksboro --out OUT --policies coverage,known/beam/xyz => task tiny: policy \"known/beam/xyz\": goal: expected one of | got \"xyz\"
+suite --tasks TINY,jacksboro --out OUT --policies coverage,known/beam/xyz => tiny.toml: policy \"known/beam/xyz\": goal: expected one of | got \"xyz\"
 suite --policies bem => policy: expected one of | got \"bem\"
 suite --worlds 0 => --worlds
 suite --tasks small --checkpoints no/such => --checkpoints: expected a folder, got no/such

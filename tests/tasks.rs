@@ -147,9 +147,9 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
     let table = table.replace("FILE", &file).replace("OTHER", &other);
     check_table(SERVER, &table.replace("PIPE", &pipe));
     let table =
-        "compare --task small --height 3 => --task <NAME|FILE> | cannot be used with | --height
+        "compare --task small --height 3 => height: expected to be left out, as the task decides it, got 3
 compare --task small --robots 2 => --robots | cannot be used with | --task
-train --task small --moves 3 --out x => --task <NAME|FILE> | cannot be used with | --moves
+train --task small --moves 3 --out x => moves: expected to be left out, as the task decides it, got 3
 compare --task ash => task ash: No such file | expected a file, or one of wildfire, small
 compare --task PIPE => expected a regular file, got a pipe
 run --task ash => task ash: No such file";

@@ -1,5 +1,6 @@
 //! The mission of an agent on one world of a running server, and checks that the server fits it.
 
+use crate::benchmark::team::Team;
 use crate::client::info::connect;
 use anyhow::{Result, bail, ensure};
 use emberwatch_learning::config::AgentConfig;
@@ -25,8 +26,9 @@ pub struct Mission {
     pub world: u32,
     /// Numbers of the robots to fly in the world. They share one belief.
     pub robots: Range<u32>,
-    /// How the agent cooperates with the other robots of the world.
-    pub cooperation: Cooperation,
+    /// How the agent acts together with the other robots of the world, which other agents may fly. Agents of a joint
+    /// team with the same belief compute the same plan, and each flies its own part.
+    pub team: Team,
     pub policy: String,
     /// Number of steps to act; 0: until stopped.
     pub steps: u64,
@@ -38,18 +40,6 @@ pub struct Mission {
     pub config: AgentConfig,
     /// Learned models, for policies that use them.
     pub learned: Learned,
-}
-
-/// How an agent cooperates with robots of its world that other agents fly.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Cooperation {
-    /// Ignores the other robots.
-    Alone,
-    /// Uses the observations of all robots, and plans only for the agent's own robots.
-    Shared,
-    /// Uses the observations of all robots, and plans for all. Agents with the same belief compute the same plan, and
-    /// each flies its own part.
-    Team,
 }
 
 impl Mission {
@@ -115,8 +105,8 @@ impl Mission {
             robots.end
         );
         ensure!(
-            robots.len() == 1 || self.cooperation == Cooperation::Team,
-            "robots: expected one robot, or several with --team"
+            robots.len() == 1 || self.team == Team::Joint,
+            "robots: expected one robot, or several with --team joint"
         );
         Ok(self.world * team + robots.start..self.world * team + robots.end)
     }

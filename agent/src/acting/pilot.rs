@@ -2,9 +2,8 @@
 
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
 use crate::acting::link::Link;
-use crate::acting::mission::{
-    Cooperation, Mission, info_of, model_of, needs_model, recorded_states,
-};
+use crate::acting::mission::{Mission, info_of, model_of, needs_model, recorded_states};
+use crate::benchmark::team::Team;
 use crate::client::errors::is_late;
 use crate::client::info::{connect, is_belief_left};
 use crate::client::view::view;
@@ -119,10 +118,10 @@ impl Pilot {
     ) -> Result<Self> {
         let connection = connect(&mission.instance)?;
         let mut client = Client::acquire(connection, &mission.claim(numbers))?;
-        client.share_frames(mission.cooperation != Cooperation::Alone);
+        client.share_frames(mission.team != Team::Alone);
         let team = client.info().n_robots;
-        let robots = match mission.cooperation {
-            Cooperation::Team => mission.world * team..(mission.world + 1) * team,
+        let robots = match mission.team {
+            Team::Joint => mission.world * team..(mission.world + 1) * team,
             _ => numbers.clone(),
         };
         let sees_truth = policy.belief.input == Input::States;

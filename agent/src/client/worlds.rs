@@ -75,7 +75,9 @@ impl Worlds {
             Self::Simulated(worlds) => {
                 let episodes = worlds.episodes(0..seeds.len())?;
                 let episodes = episodes.context("invariant: worlds are ready after a reset")?;
-                Ok(Some(episodes.iter().map(|it| it.states().clone()).collect()))
+                Ok(Some(
+                    episodes.iter().map(|it| it.states().clone()).collect(),
+                ))
             }
         }
     }

@@ -108,7 +108,9 @@ impl CompareCommand {
         let sources = sources.collect::<Result<Vec<Source>>>()?;
         for source in &sources {
             let has_teams = self.has_teams(source.task());
-            let checked = source.model().map(|it| self.policies(it, &learned, has_teams));
+            let checked = source
+                .model()
+                .map(|it| self.policies(it, &learned, has_teams));
             checked.transpose()?;
         }
         let mut report = Report::default();

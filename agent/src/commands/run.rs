@@ -1,11 +1,12 @@
 //! `run`: acts on one world of a running server.
 
 use super::shared::{parse_range, parse_seconds};
-use crate::acting::mission::{Cooperation, Mission};
+use crate::acting::mission::Mission;
 use crate::acting::run::run;
+use crate::benchmark::team::Team;
 use crate::client::info::wait_for_server;
 use crate::flags::AgentFlags;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_learning::learners;
 use emberwatch_learning::policy::{self, Policy};
@@ -36,19 +37,12 @@ pub struct RunCommand {
     /// Number of the world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
-    /// Number of the robot to fly in that world
-    #[arg(long, default_value_t = 0, conflicts_with = "robots")]
-    robot: u32,
-    /// Numbers of several robots to fly in that world; needs --team
-    #[arg(long, value_name = "FIRST..END", value_parser = parse_range::<u32>, requires = "team")]
-    robots: Option<Range<u32>>,
-    /// Plan for all flying robots of the world, on the observations of all, and fly this agent's part; agents with the
-    /// same policy and settings compute the same plan
-    #[arg(long)]
-    team: bool,
-    /// Use the observations of all robots of the world, but plan as if there were no other robots
-    #[arg(long, conflicts_with = "team")]
-    share: bool,
+    /// The robot to fly in that world, or several as FIRST..END
+    #[arg(long, value_name = "NUMBER|RANGE", default_value = "0", value_parser = parse_robots)]
+    robots: Range<u32>,
+    /// How the agent acts together with the other robots of the world; several robots need `joint`
+    #[arg(long, default_value = "alone")]
+    team: Team,
     /// Policy, as a name or as BELIEF/PLANNER/GOAL; --help lists names and parts
     #[arg(long, default_value = "beam_exploit")]
     policy: String,
@@ -82,19 +76,16 @@ impl RunCommand {
             Some(model) => Policy::named(&self.policy, model).map(drop),
             None => policy::check_name(&self.policy),
         }?;
+        ensure!(
+            self.team != Team::Oracle,
+            "--team: expected alone, shared or joint, got oracle: choose --policy oracle_beam"
+        );
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
             task: self.task.as_ref().map(task_with_model).transpose()?,
             world: self.world,
-            robots: self
-                .robots
-                .clone()
-                .unwrap_or(self.robot..self.robot.saturating_add(1)),
-            cooperation: match (self.team, self.share) {
-                (true, _) => Cooperation::Team,
-                (_, true) => Cooperation::Shared,
-                _ => Cooperation::Alone,
-            },
+            robots: self.robots.clone(),
+            team: self.team,
             policy: self.policy.clone(),
             steps: self.steps,
             shortest_step: self
@@ -126,6 +117,15 @@ fn task_with_model(task: &String) -> Result<(Task, Option<Model>)> {
     let model = settings.recorded.is_none().then_some(settings.model);
     let task = settings.task.context("invariant: a task was given")?;
     Ok((task, model))
+}
+
+/// Parses the number of a robot, or a range.
+fn parse_robots(text: &str) -> Result<Range<u32>, String> {
+    let one = text
+        .parse()
+        .ok()
+        .and_then(|robot: u32| Some(robot..robot.checked_add(1)?));
+    one.map_or_else(|| parse_range(text), Ok)
 }
 
 /// Parses a rate of at least 1 step per second. Observers would take a slower agent for dead, and a slower agent would

@@ -17,6 +17,7 @@ use emberwatch_learning::learners::filter::FILTER;
 use emberwatch_learning::learners::{self, LEARNERS, LearnerKind};
 use emberwatch_network::{Device, DeviceKind};
 use emberwatch_protocol::channels::{Instance, MAX_WORLDS};
+use emberwatch_protocol::client::Backend;
 use emberwatch_protocol::control::CoverageRule;
 use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_protocol::task::FIRST_TRAINING_SEED;
@@ -272,8 +273,18 @@ impl TrainCommand {
 
     /// Attaches to the server, or starts to simulate worlds.
     fn worlds(&self, training: &TrainingSpec) -> Result<Worlds> {
+        let episode_steps = (training.learner()?.episode_steps)(&training.config);
         if let Some(name) = &self.instance {
-            return Worlds::attach(&Instance::new(name)?, false);
+            let worlds = Worlds::attach(&Instance::new(name)?, false)?;
+            if let Some(steps) = episode_steps
+                && worlds.info().shortest_episode().is_none()
+            {
+                tracing::warn!(
+                    "instance {name:?}: its episodes have no end: in worlds of its own, this training ends them \
+                     (--max-steps {steps} of a server)"
+                );
+            }
+            return Ok(worlds);
         }
         let default = ServerConfig {
             seed: self.seed,
@@ -281,7 +292,7 @@ impl TrainCommand {
                 Preset::Default => BURN_IN,
                 Preset::Paper => 0,
             },
-            max_steps: (training.learner()?.episode_steps)(&training.config).unwrap_or(0),
+            max_steps: episode_steps.unwrap_or(0),
             ..ServerConfig::default()
         };
         simulate(self.simulation.check(&default)?, training)

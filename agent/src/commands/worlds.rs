@@ -127,7 +127,11 @@ impl WorldFlags {
         let default = ServerConfig {
             robots,
             // With the same start and the same belief, all robots would fly the same path forever.
-            start: if robots > 1 { Start::Random } else { Start::Corner },
+            start: if robots > 1 {
+                Start::Random
+            } else {
+                Start::Corner
+            },
             burn_in: BURN_IN,
             ..ServerConfig::default()
         };
