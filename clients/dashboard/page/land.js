@@ -1,5 +1,5 @@
-// Draws lines over the cells, in device pixels: hatches over no-fly cells, and a line around the observed cells. Each line has a dark and a light stroke side by side, so that one of the two is visible on
-// any cell.
+// Draws lines over the cells, in device pixels: hatches over no-fly cells, and a line around the observed cells. Each
+// line has a dark and a light stroke side by side, so that one of the two is visible on any cell.
 
 import { NEVER } from "./palette.js";
 import { cellsOf, shapeOf } from "./wire.js";

@@ -189,6 +189,9 @@ def test_missing_parts_are_left_out(studio: Studio) -> None:
     words = studio.film([server(model=None), *both(1)])
     assert "the belief is left out, as the server hid its model" in words
     assert studio.pictures()[0].shape[1] == 2 * 150 + 16 + 28
+    old = MODEL.toml.replace("[[kernel]]", '[[kernel]]\nown = "fire"')
+    words = studio.film([server(model=old, zones={"names": ["land"]}), *both(1)])
+    assert "left out, as the model has a form of an earlier release; give --model" in words
 
 
 def test_a_hidden_model_can_be_passed_by_flag(studio: Studio, tmp_path: Path) -> None:
@@ -196,6 +199,8 @@ def test_a_hidden_model_can_be_passed_by_flag(studio: Studio, tmp_path: Path) ->
     file.write_text(MODEL.toml)
     plain, given = ([server(**it), *both(1)] for it in ({}, {"model": None}))
     assert (studio.still(plain) == studio.still(given, "--model", file)).all()
+    replaced = studio.still([server(model="?"), *both(1)], "--model", file)
+    assert (replaced == studio.still(plain)).all()
     error = studio.fails([server(model=None, n_observations=4), *both(1)], "--model", file)
     assert "--model: expected one with 4 observations, as recorded, got 3" in error
 

@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--fps", type=float, default=10.0, metavar="N", help="pictures per second, 0.1 to 50 [10]")
     add("--world", type=int, default=0, metavar="N", help="number of the world [0]")
     add("--scale", type=int, metavar="N", help="side of a cell in pixels [panels of about 200]")
-    add("--model", metavar="FILE", help="a model file, if the recording's server hid its model")
+    add("--model", metavar="FILE", help="a model file [the recorded one]")
     priors = ("simulated", "initial", "uniform")
     add(
         "--prior", choices=priors, default="simulated", help="the filter's first belief [simulated]"
@@ -149,27 +149,38 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
         said.append(f"{n_lost} steps are not recorded; the belief is predicted through them")
     if flags.step is not None and len(episodes) > 1:
         said.append(f"--step: recorded in {len(episodes)} episodes; showing the first")
-    if server.model is None and flags.model is None:
-        hides = "the server hid its model"
-        if server.recorded_world is not None:
-            hides = "recorded worlds have no model"
-        said.append(f"the belief is left out, as {hides}; give --model")
     for warning in said:
-        print(f"{_NAME}: warning: {warning}", file=sys.stderr)
+        _warn(warning)
     return server, has_truth, n_steps + n_gaps
 
 
 def _model(path: str | None, server: ServerInfo) -> Model | None:
-    """Returns the model that the server revealed, or else the model of the file `path`, if any."""
+    """Returns the model of the file `path`, or without one the recorded model.
+
+    Warns and returns None if there is no recorded model, or it has a form of an earlier release.
+    """
+    if path is not None:
+        model = Model.named(path)
+        if model.n_observations != server.n_observations:
+            raise InvalidArgumentError(
+                f"--model: expected one with {server.n_observations} observations, as recorded, "
+                f"got {model.n_observations}"
+            )
+        return model
+    problem = "the server hid its model"
+    if server.recorded_world is not None:
+        problem = "recorded worlds have no model"
     if server.model is not None:
-        return Model.from_toml(server.model)
-    model = None if path is None else Model.named(path)
-    if model is not None and model.n_observations != server.n_observations:
-        raise InvalidArgumentError(
-            f"--model: expected one with {server.n_observations} observations, as recorded, "
-            f"got {model.n_observations}"
-        )
-    return model
+        try:
+            return Model.from_toml(server.model)
+        except InvalidArgumentError:
+            problem = "the model has a form of an earlier release"
+    _warn(f"the belief is left out, as {problem}; give --model")
+    return None
+
+
+def _warn(warning: str) -> None:
+    print(f"{_NAME}: warning: {warning}", file=sys.stderr)
 
 
 def _begin(prior: PriorKind, model: Model, server: ServerInfo, k: int) -> Belief:
