@@ -304,8 +304,8 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
     }
     let states = format!("--states {}", place.folder.word(""));
     let table = "train STATES --model wildfire --out x => model: expected to be left out, as the states file decides it
-compare STATES --height 3 => --states <NAME|FILE|FOLDER> | cannot be used with | --height
-train STATES --out x --burn-in 3 => --states <NAME|FILE|FOLDER> | cannot be used with | --burn-in";
+compare STATES --height 3 => height: expected to be left out, as the states file decides it
+train STATES --out x --burn-in 3 => burn_in: expected to be left out, as the states file decides it";
     check_table(AGENT, &table.replace("STATES", &states));
     let table =
         "STATES --model wildfire => model: expected to be left out, as the states file decides it
