@@ -354,7 +354,8 @@ fn flown_by(parts: &[Range<u32>], cooperation: &str) -> (Vec<Vec<Vec<u8>>>, f64)
         } else {
             format!("--robot {}", robots.start)
         };
-        let flags = format!("--steps {N_STEPS} --policy beam_exploit --takeover {cooperation}");
+        let flags =
+            format!("--steps {N_STEPS} --policy known/beam/exploit --takeover {cooperation}");
         Program::agent(&server.instance, &format!("{robots} {flags}"))
     };
     let agents: Vec<_> = parts.iter().map(start).collect();
