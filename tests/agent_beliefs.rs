@@ -87,7 +87,7 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
     let observer = Observer::agents(&server.instance).expect("observe");
     let compare = |n_steps: u64| {
         let words = format!(
-            "compare --policies beam_exploit --baseline beam_exploit --seeds 0..8 --steps {n_steps} \
+            "compare --policies known/beam/exploit --baseline known/beam/exploit --seeds 0..8 --steps {n_steps} \
              {}",
             on(&server)
         );

@@ -82,22 +82,25 @@ fn a_checkpoint_keeps_hidden_vectors_goes_on_and_is_acted_on() {
     assert!(checkpoint == place.bytes("out"), "the checkpoint changed");
     assert_eq!(place.folder.text("out/frozen.csv").lines().count(), 1 + 9);
 
-    for policy in ["autoencoder_policy", "autoencoder/beam/exploit"] {
+    for policy in ["autoencoder/shooting/learned", "autoencoder/beam/exploit"] {
         let flags = format!("--policies {policy},coverage --baseline coverage");
         place.compare("out", &flags).check_prints(policy);
     }
     let (ladder, flag) = (place.compare("out", ""), place.flag("out"));
     for policy in [
-        "autoencoder_exploit",
+        "autoencoder/shooting/exploit",
         "autoencoder/shooting/explore",
-        "autoencoder_policy",
+        "autoencoder/shooting/learned",
     ] {
         ladder.check_prints(policy);
     }
     let server = Server::start(WORLD);
-    let run = format!("run {} --steps 5 --policy autoencoder_policy", on(&server));
+    let run = format!(
+        "run {} --steps 5 --policy autoencoder/shooting/learned",
+        on(&server)
+    );
     agent(&format!("{run} {flag}"));
-    let words = "autoencoder_policy | needs --checkpoint FILE: expected a checkpoint of `train --learner autoencoder`";
+    let words = "autoencoder/shooting/learned | needs --checkpoint FILE: expected a checkpoint of `train --learner autoencoder`";
     check(AGENT, &run, words);
     let twice = format!("compare {flag} {flag} {COMPARED}");
     check(

@@ -75,7 +75,7 @@ fn a_comparison_repeats_to_the_bit_on_any_server() {
 #[test]
 fn without_hidden_states_what_needs_them_is_empty() {
     let policies =
-        "--policies beam_exploit,known/beam/explore,coverage --baseline known/beam/exploit";
+        "--policies known/beam/exploit,known/beam/explore,coverage --baseline known/beam/exploit";
     let mut expected = compare(&format!("{LIVELY} {policies}"));
     for run in &mut expected {
         let of_states = (run.burning_seen_share.take(), run.front_distance.take());
@@ -87,13 +87,13 @@ fn without_hidden_states_what_needs_them_is_empty() {
     assert_eq!(compare(&format!("{policies} {instance}")), expected);
     let ended = agent(&format!("{WHAT} {policies} {instance}"));
     ended.check_prints("no hidden states were published");
-    ended.check_prints("differences are paired by world, to beam_exploit");
+    ended.check_prints("differences are paired by world, to known/beam/exploit");
     agent("compare --policies help").check_prints("learned+spatial");
 }
 
 #[test]
 fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
-    let alone = compare(&format!("{LIVELY} --policies beam_exploit"));
+    let alone = compare(&format!("{LIVELY} --policies known/beam/exploit"));
     let rows = compare(&format!(
         "{LIVELY} --robots 1,3 --team alone,shared,joint,oracle"
     ));
@@ -121,7 +121,7 @@ fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
 fn runs_with_one_seed_act_alike() {
     let act = || {
         let server = Server::start(WORLDS);
-        let flags = "--policy shooting_exploit --steps 20 --shooting-samples 32";
+        let flags = "--policy shooting --steps 20 --shooting-samples 32";
         Program::agent(&server.instance, flags).ends(0);
         assert_eq!(server.holder(), None);
         server.observe(0)
@@ -140,7 +140,7 @@ fn a_second_model_runs_from_end_to_end() {
     assert_eq!(server.info().observations, ["dark", "shiny", "white"]);
     for flags in [
         "--steps 30 --beam-width 5 --policy known/beam/ice",
-        "--steps 10 --shooting-samples 9 --policy shooting_gritted",
+        "--steps 10 --shooting-samples 9 --policy known/shooting/gritted",
     ] {
         Program::agent(&server.instance, flags).ends(0);
     }

@@ -48,7 +48,11 @@ fn undisturbed(n_steps: u64, policy: &str) -> Vec<Vec<Move>> {
 
 #[test]
 fn an_agent_that_takes_over_flies_as_the_other_would_have() {
-    for policy in ["shooting_explore", "spatial_beam", "known/options/rule"] {
+    for policy in [
+        "known/shooting/explore",
+        "known+spatial/beam/exploit",
+        "known/options/rule",
+    ] {
         let policy = format!("--policy {policy}");
         let server = Server::start(&format!("{FLAGS} {ALL}"));
         let observer = Observer::frames(&server.instance).expect("observe");
@@ -74,7 +78,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
 
 #[test]
 fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
-    let policy = "--policy beam_exploit";
+    let policy = "--policy known/beam/exploit";
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
     let mut client = server.acquire(0..1);

@@ -121,10 +121,10 @@ fn snapshots_and_agents_of_a_land_go_on() {
     let again = Server::start(&format!("{} {restore}", flags(&model)));
     assert_eq!(future(&mut again.acquire(0..2), 2), went_on);
     for policy in [
-        "beam_exploit",
-        "shooting_explore",
+        "known/beam/exploit",
+        "known/shooting/explore",
         "random_walk",
-        "spatial_beam",
+        "known+spatial/beam/exploit",
         "oracle_ahead",
     ] {
         agent(&format!(

@@ -226,7 +226,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
         "coverage",
         "oracle_ahead",
         "random_walk",
-        "learned_spatial_beam",
+        "learned+spatial/beam/exploit",
     ] {
         let ended = act(&format!("run --policy {policy} --steps 70 {checkpoint}"));
         ended.check_says("steps=70");
@@ -240,9 +240,9 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     assert!(!ladder.stdout.contains("| beam_"), "{}", ladder.stdout);
     let no_model = "filters with a model, and recorded worlds have none";
     for (words, expected) in [
-        ("run --policy spatial_beam", no_model),
+        ("run --policy known+spatial/beam/exploit", no_model),
         (
-            "compare --policies coverage,shooting_explore --seeds 0..1",
+            "compare --policies coverage,known/shooting/explore --seeds 0..1",
             no_model,
         ),
         (
@@ -265,7 +265,7 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
     place.write(0, &states);
     let folder = Folder::default();
     let compare = format!(
-        "compare --states {} --moves 4 --seeds 0..2 --steps 4 --policies beam_exploit,spatial_beam,coverage \
+        "compare --states {} --moves 4 --seeds 0..2 --steps 4 --policies known/beam/exploit,beam,coverage \
          --baseline coverage --csv {}",
         place.folder.word(""),
         folder.word("rows.csv")
@@ -288,7 +288,7 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
     for (flags, words) in [
         (
             "",
-            "policy \"beam_exploit\" filters with a model, and recorded worlds have none",
+            "policy \"known/beam/exploit\" filters with a model, and recorded worlds have none",
         ),
         (
             "--model wildfire",

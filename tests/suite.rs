@@ -65,8 +65,8 @@ fn a_suite_keeps_equal_rows_and_its_results_make_a_page() {
     let rows = place.rows("coverage");
     assert_eq!(rows.len(), 3);
     // Kept rows are not run again, so their planning times are unchanged.
-    let more = place.suite("--policies coverage,beam_exploit,learned_beam");
-    more.check_prints("| beam_exploit |");
+    let more = place.suite("--policies coverage,known/beam/exploit,learned_beam");
+    more.check_prints("| known/beam/exploit |");
     more.check_says("3 rows of coverage kept");
     more.check_says("learned_beam is not run: it needs a checkpoint");
     assert_eq!(place.rows("coverage"), rows);
@@ -75,8 +75,10 @@ fn a_suite_keeps_equal_rows_and_its_results_make_a_page() {
         .check_says("2 rows of coverage kept");
     assert_eq!(place.rows("coverage"), rows);
     place
-        .suite("--policies coverage,beam_exploit --beam-width 2")
-        .check_says("beam_exploit is run: its rows are from another build, checkpoint or settings");
+        .suite("--policies coverage,known/beam/exploit --beam-width 2")
+        .check_says(
+            "known/beam/exploit is run: its rows are from another build, checkpoint or settings",
+        );
     // A program with one more byte stands for a program built from changed files.
     let mut program = std::fs::read(program_path(AGENT)).expect("a program");
     program.push(0);
@@ -91,7 +93,12 @@ fn a_suite_keeps_equal_rows_and_its_results_make_a_page() {
 
     let early = place.entry("coverage");
     check(AGENT, &early, "expected an entry of random_walk");
-    for policy in ["random_walk", "oracle_ahead", "coverage", "beam_exploit"] {
+    for policy in [
+        "random_walk",
+        "oracle_ahead",
+        "coverage",
+        "known/beam/exploit",
+    ] {
         agent(&place.entry(policy));
     }
     let text = place.0.text("page.md");
@@ -169,7 +176,8 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     let words = |flags: &str| {
         let [tiny, fires, out, runs] =
             ["tiny.toml", "fires.toml", "out", "runs"].map(|name| folder.word(name));
-        let policies = "learned_beam,learned_policy,neural_beam,beam_exploit,known/options/learned";
+        let policies =
+            "learned_beam,learned_policy,neural_beam,known/beam/exploit,known/options/learned";
         format!(
             "suite --tasks {tiny},{fires} --out {out} --policies {policies} --checkpoints {runs} {flags}"
         )

@@ -270,7 +270,7 @@ fn a_checkpoint_is_compared_and_checked() {
     for policy in [
         "learned/shooting/exploit",
         "learned_beam",
-        "learned_spatial_beam",
+        "learned+spatial/beam/exploit",
     ] {
         compared.check_prints(policy);
     }
@@ -286,7 +286,7 @@ fn a_checkpoint_is_compared_and_checked() {
         on(&server)
     );
     agent(&format!("{run} {other}"));
-    let words = "learned_spatial_beam | needs --checkpoint FILE: expected a checkpoint of `train --learner filter`";
+    let words = "learned+spatial/beam/exploit | needs --checkpoint FILE: expected a checkpoint of `train --learner filter`";
     check(AGENT, &run, words);
     let resume = format!("{WORLDS} --steps 8 --resume");
     place.train("other", &resume);

@@ -39,6 +39,8 @@ const LAST_SEEN: BeliefKind = BeliefKind {
     about: "the last observation of each cell, less certain with each step",
     input: Input::Frames,
     knows_model: true,
+    has_options: false,
+    is_parallel: false,
     learned_by: None,
     chart: ("last seen", [0x88, 0x22, 0x55]),
     handover: None,
@@ -71,7 +73,7 @@ impl Estimator for LastSeen {
 fn main() -> Result<()> {
     let model = Model::wildfire();
     let mut policies = vec![Policy::new(&LAST_SEEN, &BEAM, Goal::Exploit, &model)];
-    for name in ["random_walk", "coverage", "beam_exploit"] {
+    for name in ["random_walk", "coverage", "beam"] {
         policies.push(Policy::named(name, &model)?);
     }
     for policy in policies {

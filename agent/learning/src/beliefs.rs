@@ -21,7 +21,10 @@ pub use self::truth::{NONE, TRUTH};
 pub use self::world_form::WorldForm;
 use emberwatch_model::text::shortened;
 
-/// All kinds, ordered by how much they know about the world.
+/// The default where a model is known (measured in `docs/filters.md`). [`KNOWN`] is the paper's filter.
+pub const RECOMMENDED: &BeliefKind = &KNOWN_SPATIAL_CAVITIES;
+
+/// All kinds.
 pub const BELIEFS: &[&BeliefKind] = &[
     &NONE,
     &KNOWN,
@@ -43,18 +46,11 @@ pub fn named(name: &str) -> Option<&'static BeliefKind> {
 
 /// Finds a kind like [`named`], but only among the kinds of belief on which a DQN can learn to choose options.
 ///
-/// Such a belief is corrected by frames, and it either knows the model or is learned, but not both. Kinds whose learner
-/// already learns which objective to plan for are excluded.
-///
 /// # Errors
 /// If there is no such kind. The error lists the names of all valid kinds.
 pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
-    let serves = |kind: &&BeliefKind| {
-        let has_one_source = !kind.knows_model || kind.learned_by.is_none();
-        kind.input == Input::Frames && has_one_source && !kind.decides()
-    };
-    named(name).filter(serves).ok_or_else(|| {
-        let kinds = BELIEFS.iter().copied().filter(serves);
+    named(name).filter(|kind| kind.has_options).ok_or_else(|| {
+        let kinds = BELIEFS.iter().filter(|kind| kind.has_options);
         let names: Vec<&str> = kinds.map(|kind| kind.name).collect();
         format!(
             "expected one of {}, got {:?}",

@@ -2,7 +2,7 @@
 //! caller flies the paths.
 
 use crate::beliefs::autoencoder::AutoencoderModel;
-use crate::beliefs::{BELIEFS, BeliefKind, Conditions, KNOWN, WorldForm};
+use crate::beliefs::{BELIEFS, BeliefKind, Conditions, RECOMMENDED, WorldForm};
 use crate::config::AgentConfig;
 use crate::learned::Learned;
 use crate::policy::{BY_OPTIONS, Goal, LearnedDecisions, Policy};
@@ -43,8 +43,8 @@ pub struct Shown {
 }
 
 impl Crew {
-    /// Creates the shared data. If `estimator` is `None`, the checkpoint's estimator is used, or the known-model filter
-    /// if there is no checkpoint.
+    /// Creates the shared data. If `estimator` is `None`, the checkpoint's estimator is used, or [`RECOMMENDED`] if
+    /// there is no checkpoint.
     ///
     /// # Errors
     /// If the checkpoint lacks the estimator, or was trained in worlds of another form. The message begins with
@@ -60,7 +60,7 @@ impl Crew {
         ensure!(
             learned.get::<AutoencoderModel>().is_none(),
             "checkpoint: expected a belief that options can be planned on, such as {}, got an autoencoder",
-            KNOWN.name
+            RECOMMENDED.name
         );
         kind.learned(&learned).context("checkpoint")?;
         kind.check(&learned, &WorldForm::of(&model, shape))?;
@@ -115,15 +115,16 @@ impl Crew {
     }
 }
 
-/// Returns the default kind of belief: the kind that learned decisions are based on, otherwise a learned kind,
-/// otherwise [`KNOWN`].
+/// Returns the default kind of belief: the kind that learned decisions are based on, otherwise the kind of a
+/// learned model, otherwise [`RECOMMENDED`].
 pub fn usual(learned: &Learned) -> &'static BeliefKind {
     let decided = learned
         .get::<LearnedDecisions>()
         .map(|decisions| decisions.belief);
-    let mut kinds = BELIEFS.iter().copied();
-    let found = kinds.find(|kind| kind.learned_by.is_some() && kind.learned(learned).is_ok());
-    decided.or(found).unwrap_or(&KNOWN)
+    let mut kinds = BELIEFS.iter();
+    let found = kinds.find_map(|kind| kind.learned(learned).ok().flatten());
+    let found = found.map(|model| model.kind());
+    decided.or(found).unwrap_or(RECOMMENDED)
 }
 
 impl Planned {

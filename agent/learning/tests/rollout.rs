@@ -60,7 +60,7 @@ const CELLS: [Cell; 3] = [
 
 #[test]
 fn missed_steps_equal_steps_with_empty_frames() {
-    let [mut late, mut hovering] = [0; 2].map(|_| robot("beam_exploit", &CELLS[..1]));
+    let [mut late, mut hovering] = [0; 2].map(|_| robot("known/beam/exploit", &CELLS[..1]));
     let empty = |step| {
         let mut seen = seen(step, &CELLS[..1]);
         seen.observation.frame = Frame::empty(shape());
@@ -83,7 +83,7 @@ fn missed_steps_equal_steps_with_empty_frames() {
 
 #[test]
 fn a_correction_raises_the_score_of_its_frame() {
-    let mut agent = robot("beam_exploit", &CELLS[..1]);
+    let mut agent = robot("known/beam/exploit", &CELLS[..1]);
     agent.plan();
     agent.agent.predict();
     let seen = seen(1, &CELLS[..1]);
@@ -101,8 +101,8 @@ fn a_correction_raises_the_score_of_its_frame() {
 fn agents_together_act_as_each_agent_alone() {
     let new = || {
         vec![
-            robot("beam_exploit", &CELLS[..2]),
-            robot("beam_exploit", &CELLS[2..]),
+            robot("known/beam/exploit", &CELLS[..2]),
+            robot("known/beam/exploit", &CELLS[2..]),
         ]
     };
     let (mut together, mut alone) = (new(), new());
@@ -127,8 +127,8 @@ fn agents_together_act_as_each_agent_alone() {
 #[test]
 fn the_first_robot_of_a_team_flies_as_it_would_alone() {
     for policy in [
-        "beam_exploit",
-        "shooting_exploit",
+        "known/beam/exploit",
+        "shooting",
         "random_walk",
         "known/options/exploit_ahead_3",
     ] {

@@ -15,7 +15,7 @@ use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
-use emberwatch_learning::beliefs::NONE;
+
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_learning::learned::Learned;
@@ -36,17 +36,17 @@ const OPTIONS: &str = "options";
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(10);
 
 /// The default policy for comparisons of teams.
-const TEAM_POLICY: &str = "beam_exploit";
+const TEAM_POLICY: &str = "beam";
 
 /// Compare policies on the same worlds.
 #[derive(Args)]
 pub struct CompareCommand {
     /// Policies, separated by commas, as names or as BELIEF/PLANNER/GOAL; `help` lists names and parts; `options`
     /// stands for each option, the rule and the learned choice, on the belief of learned decisions [default: a ladder
-    /// of policies from random to oracle; with teams: beam_exploit]
+    /// of policies from random to oracle; with teams: beam]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
-    /// Policy to compare the other policies with, paired by world [default: shooting_exploit; with options: the option
+    /// Policy to compare the other policies with, paired by world [default: shooting; with options: the option
     /// `exploit`; with teams: the first policy; on recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
@@ -249,7 +249,7 @@ impl CompareCommand {
         };
         let policies = match self.policies.as_slice() {
             [] if has_teams => vec![named(&TEAM_POLICY.to_owned())?],
-            [] => ladder(model, learned),
+            [] => policy::ladder(model, learned),
             names => {
                 let policies = names.iter().map(with_options);
                 policies.collect::<Result<Vec<_>>>()?.concat()
@@ -295,11 +295,7 @@ impl CompareCommand {
         } else {
             policies.next().filter(|_| has_teams)
         };
-        let default = if lacks_model {
-            "coverage"
-        } else {
-            "shooting_exploit"
-        };
+        let default = if lacks_model { "coverage" } else { "shooting" };
         Ok(found.map_or(default, |policy| &policy.name).to_owned())
     }
 }
@@ -331,22 +327,6 @@ fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
     let decisions =
         decisions.context("--policies options: expected --checkpoint FILE of learned decisions")?;
     Ok(policy::options_table(decisions.belief, model))
-}
-
-/// Returns the ladder with learned policies inserted: the autoencoder's policies follow the policies without a belief,
-/// and all others follow the known-model policies.
-fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
-    let of_learned = policy::of_learned(learned, model).into_iter();
-    let (network, others): (Vec<_>, Vec<_>) =
-        of_learned.partition(|policy| policy.belief.decides());
-    let mut ladder = policy::ladder(model);
-    let mut insert = |after: &dyn Fn(&Policy) -> bool, policies: Vec<Policy>| {
-        let at = ladder.iter().rposition(after).map_or(0, |last| last + 1);
-        ladder.splice(at..at, policies);
-    };
-    insert(&|policy| policy.belief.knows_model, others);
-    insert(&|policy| *policy.belief == NONE, network);
-    ladder
 }
 
 /// Runs a comparison and logs its progress.

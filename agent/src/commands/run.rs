@@ -44,7 +44,7 @@ pub struct RunCommand {
     #[arg(long, default_value = "alone")]
     team: Team,
     /// Policy, as a name or as BELIEF/PLANNER/GOAL; --help lists names and parts
-    #[arg(long, default_value = "beam_exploit")]
+    #[arg(long, default_value = "beam")]
     policy: String,
     /// Number of steps to act; 0: until stopped
     #[arg(long, default_value_t = 0)]

@@ -40,7 +40,7 @@ pub struct SuiteCommand {
     #[arg(
         long,
         value_delimiter = ',',
-        default_value = "coverage,beam_exploit,learned_beam,learned_policy"
+        default_value = "coverage,beam,learned_beam,learned_policy"
     )]
     policies: Vec<String>,
     /// Folder of checkpoints for learned policies, written by --train or by `train --task TASK --out FOLDER/TASK/LEARNER`

@@ -189,7 +189,7 @@ def main() -> None:
         "--simulate", type=int, default=12, metavar="N", help="number of simulated fires"
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the simulated fires")
-    kinds = [kind for kind in belief.kinds() if kind.startswith("known")]
+    kinds = [name for name, kind in belief.kinds().items() if not kind.needs_checkpoint]
     parser.add_argument("--kinds", default=",".join(kinds), help="kinds of belief, comma-separated")
     args = parser.parse_args()
     for path in args.fires or []:

@@ -28,6 +28,7 @@ mod threads;
 mod windows;
 mod wire;
 
+use emberwatch_learning::beliefs::RECOMMENDED;
 use emberwatch_messages::interrupt::interrupt_when;
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::maps::{MAX_ARCHIVE_BYTES, MAX_MAP_VALUES};
@@ -59,13 +60,13 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<merit::MeritTally>()?;
     module.add_class::<options::Options>()?;
     module.add_function(wrap_pyfunction!(origin::checkpoint_bytes, module)?)?;
-    module.add_function(wrap_pyfunction!(options::estimator_names, module)?)?;
     module.add_function(wrap_pyfunction!(options::option_names, module)?)?;
     module.add_function(wrap_pyfunction!(origin::belief_kinds, module)?)?;
     module.add_class::<backend::CheckedSettings>()?;
     module.add_function(wrap_pyfunction!(backend::model_text, module)?)?;
     module.add_function(wrap_pyfunction!(backend::read_again, module)?)?;
     module.add_function(wrap_pyfunction!(prior::simulated_prior, module)?)?;
+    module.add("RECOMMENDED", RECOMMENDED.name)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;
     module.add("FIRST_TRAINING_SEED", FIRST_TRAINING_SEED)?;
     module.add("MAX_ARCHIVE_BYTES", MAX_ARCHIVE_BYTES)?;

@@ -35,14 +35,6 @@ pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
     )
 }
 
-/// Returns the name and a description of each estimator on which options can be planned.
-#[pyfunction]
-pub fn estimator_names() -> Vec<(&'static str, &'static str)> {
-    let serves = |kind: &&BeliefKind| beliefs::of_options(kind.name).is_ok();
-    let kinds = beliefs::BELIEFS.iter().copied().filter(serves);
-    kinds.map(|kind| (kind.name, kind.about)).collect()
-}
-
 /// The attributes of Python's `WorldSpec` that beliefs and plans depend on.
 #[derive(FromPyObject)]
 pub struct Spec<'py> {

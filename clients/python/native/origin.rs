@@ -6,9 +6,7 @@ use crate::refusal::{invalid, refused};
 use crate::threads::Pool;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
 use emberwatch_belief::estimation::estimator::Estimator;
-use emberwatch_learning::beliefs::{
-    AUTOENCODER, BELIEFS, BeliefKind, Conditions, Input, KNOWN, NEURAL, NEURAL_SENSOR, named,
-};
+use emberwatch_learning::beliefs::{BELIEFS, BeliefKind, Conditions, Input, KNOWN, named};
 use emberwatch_learning::checkpoint::read_bytes;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners;
@@ -26,10 +24,23 @@ pub struct Origin {
     pub shape: Shape,
 }
 
-/// Returns the name and a description of each kind of belief that is corrected with frames.
+/// The name of a kind of belief and the fields of Python's `Kind`.
+type Facts = (&'static str, &'static str, bool, bool, bool);
+
+/// Returns the facts of each kind of belief that is corrected with frames.
 #[pyfunction]
-pub fn belief_kinds() -> Vec<(&'static str, &'static str)> {
-    of_frames().map(|kind| (kind.name, kind.about)).collect()
+pub fn belief_kinds() -> Vec<Facts> {
+    let facts = |kind: &BeliefKind| {
+        let needs_checkpoint = kind.learned_by.is_some();
+        (
+            kind.name,
+            kind.about,
+            kind.knows_model,
+            needs_checkpoint,
+            kind.has_options,
+        )
+    };
+    of_frames().map(facts).collect()
 }
 
 impl Origin {
@@ -83,16 +94,10 @@ impl Origin {
     }
 
     /// Returns whether a step is too short to divide among threads, as with the plain filter or a single world. Never
-    /// true for networks.
+    /// true for parallel kinds: all their work must run on a [`Pool`], as they would use rayon's global pool elsewhere.
     pub fn is_short(&self, n_worlds: usize) -> bool {
-        *self.kind == KNOWN || (n_worlds <= 1 && !is_network(self.kind))
+        *self.kind == KNOWN || (n_worlds <= 1 && !self.kind.is_parallel)
     }
-}
-
-/// Returns whether beliefs of this kind divide their own work among threads. All their work must run on a [`Pool`], as
-/// they would use rayon's global pool elsewhere.
-pub fn is_network(kind: &BeliefKind) -> bool {
-    [NEURAL, NEURAL_SENSOR, AUTOENCODER].contains(kind)
 }
 
 /// Returns the bytes of a checkpoint, to be read only once.

@@ -1,7 +1,6 @@
 //! Single-robot worlds with their beliefs and plans: belief updates, planning, and publishing to observers.
 
 use crate::answer::RESULT_BYTES;
-use crate::origin::is_network;
 use crate::threads::{Pool, Threads};
 use crate::wire::{Feed, View};
 use anyhow::{Context, Result, ensure};
@@ -289,9 +288,10 @@ impl WorldWork<'_> {
     }
 }
 
-/// Returns whether the work is too short to divide among threads, as with a single world. Never true for networks.
+/// Returns whether the work is too short to divide among threads, as with a single world. Never true for kinds of
+/// belief that are parallel.
 fn is_short(crew: &Crew, n_worlds: usize) -> bool {
-    n_worlds <= 1 && !is_network(crew.estimator())
+    n_worlds <= 1 && !crew.estimator().is_parallel
 }
 
 fn no_such_world(n_worlds: usize, got: usize) -> String {

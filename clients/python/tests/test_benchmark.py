@@ -56,7 +56,7 @@ def states(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("robots", "recent_steps", "policy"), [(3, 2, "beam_exploit"), (1, 3, "coverage")]
+    ("robots", "recent_steps", "policy"), [(3, 2, "known/beam/exploit"), (1, 3, "coverage")]
 )
 def test_replayed_paths_have_exactly_the_same_scores(
     tmp_path: Path, states: Path, robots: int, recent_steps: int, policy: str

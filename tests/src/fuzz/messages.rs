@@ -200,7 +200,7 @@ pub fn outlook_seeds() -> Vec<Seed> {
         ..AgentHeader::default()
     };
     let intent = Intent {
-        policy: "beam_exploit".into(),
+        policy: "known/beam/exploit".into(),
         states: vec!["normal".into(), "fire".into()],
         ..Intent::default()
     };

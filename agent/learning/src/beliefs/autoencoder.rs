@@ -4,6 +4,7 @@
 pub use super::follower::Follower;
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
+use super::learned::LEARNED;
 use super::world_form::WorldForm;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::correct;
@@ -20,12 +21,14 @@ pub const AUTOENCODER: BeliefKind = BeliefKind {
     about: "the paper's dynamic autoencoder",
     input: Input::Frames,
     knows_model: false,
+    has_options: false,
+    is_parallel: true,
     learned_by: Some(LearnedBy {
         learner: "autoencoder",
         decides: true,
         find: |learned| learned.get::<AutoencoderModel>().map(|model| model as _),
     }),
-    chart: ("learned", [0x00, 0x9e, 0x73]),
+    chart: LEARNED.chart,
     handover: None,
     build: |conditions| {
         let model = conditions.learned.get::<AutoencoderModel>();
@@ -55,6 +58,10 @@ impl PartialEq for AutoencoderModel {
 }
 
 impl LearnedBelief for AutoencoderModel {
+    fn kind(&self) -> &'static BeliefKind {
+        &AUTOENCODER
+    }
+
     fn target(&self) -> usize {
         self.target
     }

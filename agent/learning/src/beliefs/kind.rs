@@ -17,6 +17,10 @@ pub struct BeliefKind {
     pub input: Input,
     /// Whether it uses the true model.
     pub knows_model: bool,
+    /// Whether a DQN can learn to choose options on it.
+    pub has_options: bool,
+    /// Whether a single estimator divides its work among threads.
+    pub is_parallel: bool,
     /// The learner of this kind. `None` if nothing is learned.
     pub learned_by: Option<LearnedBy>,
     /// Legend text and colour (red, green, blue) of its policies in charts.
@@ -49,6 +53,9 @@ pub struct LearnedBy {
 
 /// A learned model for a kind of belief, from a checkpoint.
 pub trait LearnedBelief {
+    /// Returns the kind that the learner trains for.
+    fn kind(&self) -> &'static BeliefKind;
+
     /// Returns the state with the highest estimated reward.
     fn target(&self) -> usize;
 

@@ -13,6 +13,8 @@ pub const KNOWN: BeliefKind = BeliefKind {
     about: "the Bayes filter with the true model",
     input: Input::Frames,
     knows_model: true,
+    has_options: true,
+    is_parallel: false,
     learned_by: None,
     chart: ("known model", [0x00, 0x72, 0xb2]),
     handover: Some(|model| BayesFilter::handover_of_known(model, false)),

@@ -17,6 +17,8 @@ pub const LEARNED: BeliefKind = BeliefKind {
     about: "a Bayes filter with learned parameters",
     input: Input::Frames,
     knows_model: false,
+    has_options: true,
+    is_parallel: false,
     learned_by: Some(LearnedBy {
         learner: "filter",
         decides: false,
@@ -78,6 +80,10 @@ impl LearnedModel {
 }
 
 impl LearnedBelief for LearnedModel {
+    fn kind(&self) -> &'static BeliefKind {
+        &LEARNED
+    }
+
     fn target(&self) -> usize {
         self.target
     }

@@ -9,7 +9,7 @@
 mod sensor;
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
-use super::learned::{LearnedModel, SavedModel, check_target};
+use super::learned::{LEARNED, LearnedModel, SavedModel, check_target};
 use super::world_form::WorldForm;
 use crate::checkpoint::{Part, check};
 use crate::parallel::in_parallel;
@@ -34,12 +34,14 @@ pub const NEURAL: BeliefKind = BeliefKind {
     about: "a learned network that predicts observations from the last ones",
     input: Input::Frames,
     knows_model: false,
+    has_options: true,
+    is_parallel: true,
     learned_by: Some(LearnedBy {
         learner: "neural",
         decides: false,
         find: |learned| learned.get::<NeuralModel>().map(|model| model as _),
     }),
-    chart: ("learned", [0x00, 0x9e, 0x73]),
+    chart: LEARNED.chart,
     handover: None,
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
@@ -53,6 +55,7 @@ pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
     name: "neural+sensor",
     about: "neural, converted to states by the true model's observation matrix",
     knows_model: true,
+    has_options: false,
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
         let model = model.context("checkpoint: expected a learned neural belief, got none")?;
@@ -98,6 +101,10 @@ impl NeuralModel {
 }
 
 impl LearnedBelief for NeuralModel {
+    fn kind(&self) -> &'static BeliefKind {
+        &NEURAL
+    }
+
     fn target(&self) -> usize {
         self.target
     }

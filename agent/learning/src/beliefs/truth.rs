@@ -8,6 +8,8 @@ pub const NONE: BeliefKind = BeliefKind {
     about: "the first belief, never updated",
     input: Input::Nothing,
     knows_model: false,
+    has_options: false,
+    is_parallel: false,
     learned_by: None,
     chart: ("no belief", [0xa3, 0xa3, 0xa3]),
     handover: None,

@@ -2,18 +2,19 @@
 
 use super::decisions::LearnedDecisions;
 use super::parts::{Goal, Policy};
-use super::planners::{self, AHEAD, BEAM, RANDOM, SHOOTING};
+use super::planners::{AHEAD, BEAM, BY_OPTIONS, RANDOM, SHOOTING};
 use crate::beliefs::{
-    AUTOENCODER, BeliefKind, Input, KNOWN, KNOWN_SPATIAL, LEARNED, LEARNED_SPATIAL, NEURAL, NONE,
+    AUTOENCODER, BeliefKind, Input, KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL, NONE, RECOMMENDED,
     TRUTH,
 };
 use crate::learned::Learned;
 use emberwatch_belief::planning::options::OPTIONS;
 use emberwatch_model::Model;
 
-/// Returns the policies of the benchmark for a model, from the least to the most informed.
-pub fn ladder(model: &Model) -> Vec<Policy> {
+/// Returns the policies of the benchmark for a model and checkpoints, from the least to the most informed.
+pub fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
     use Goal::{Coverage, Exploit, ExploitOnly, Explore, Rule, State};
+    let policy = |(belief, planner, goal)| Policy::new(belief, planner, goal, model);
     let states = (0..model.n_states()).filter(|state| *state != model.target_state());
     let states = states.map(|state| (&KNOWN, &SHOOTING, State(state)));
     let first = [
@@ -21,49 +22,46 @@ pub fn ladder(model: &Model) -> Vec<Policy> {
         (&NONE, &SHOOTING, Coverage),
         (&KNOWN, &SHOOTING, Explore),
     ];
-    let rest = [
+    let known = [
         (&KNOWN, &SHOOTING, Exploit),
         (&KNOWN, &SHOOTING, ExploitOnly),
         (&KNOWN, &BEAM, Exploit),
-        (&KNOWN_SPATIAL, &SHOOTING, Exploit),
-        (&KNOWN_SPATIAL, &BEAM, Exploit),
+        (RECOMMENDED, &SHOOTING, Exploit),
+        (RECOMMENDED, &BEAM, Exploit),
+    ];
+    let oracles = [
         (&TRUTH, &SHOOTING, Exploit),
         (&TRUTH, &BEAM, Exploit),
         (&TRUTH, &AHEAD, Exploit),
-        (&TRUTH, &planners::BY_OPTIONS, Rule),
+        (&TRUTH, &BY_OPTIONS, Rule),
     ];
-    let all = first.into_iter().chain(states).chain(rest);
-    all.map(|(belief, planner, goal)| Policy::new(belief, planner, goal, model))
-        .collect()
+    let known = first.into_iter().chain(states).chain(known).map(policy);
+    let of_learned = of_learned(learned, model).into_iter();
+    known.chain(of_learned).chain(oracles.map(policy)).collect()
 }
 
 /// Learned beliefs that are compared by default, each in its best variant (`docs/filters.md`).
 const LEARNED_BELIEFS: [&BeliefKind; 4] = [&LEARNED, &LEARNED_SPATIAL, &NEURAL, &AUTOENCODER];
 
 /// Returns the default policies for checkpoints: shooting and beam search on learned beliefs, and a DQN's decisions.
-pub fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
+fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
     use Goal::{Exploit, Explore};
-    let policy = |belief, planner, goal| Policy::new(belief, planner, goal, model);
-    let mut policies = Vec::new();
+    let mut all = Vec::new();
     for belief in LEARNED_BELIEFS {
         if belief.decides() {
-            policies.push(policy(belief, &SHOOTING, Explore));
+            let goals = [Explore, Goal::Learned];
+            all.extend(goals.map(|goal| (belief, &SHOOTING, goal)));
         }
-        policies.push(policy(belief, &SHOOTING, Exploit));
-        if belief.decides() {
-            policies.push(policy(belief, &SHOOTING, Goal::Learned));
-        }
-        policies.push(policy(belief, &BEAM, Exploit));
+        all.extend([&SHOOTING, &BEAM].map(|planner| (belief, planner, Exploit)));
     }
-    if let Some(decisions) = learned.get::<LearnedDecisions>() {
-        policies.push(policy(
-            decisions.belief,
-            &planners::BY_OPTIONS,
-            Goal::Learned,
-        ));
-    }
-    policies.retain(|policy| policy.check(learned).is_ok());
+    let decisions = learned.get::<LearnedDecisions>();
+    all.extend(decisions.map(|it| (it.belief, &BY_OPTIONS, Goal::Learned)));
+    let policies = all.into_iter();
+    let policies =
+        policies.map(|(belief, planner, goal)| Policy::new(belief, planner, goal, model));
     policies
+        .filter(|policy| policy.check(learned).is_ok())
+        .collect()
 }
 
 /// Returns the policies for a table of all options on one belief: random moves, then each option, the rule, and, if
@@ -73,7 +71,7 @@ pub fn options_table(belief: &'static BeliefKind, model: &Model) -> Vec<Policy> 
     let learned = (belief.input == Input::Frames).then_some(Goal::Learned);
     let goals = options.chain(learned);
     let first = Policy::new(&NONE, &RANDOM, Goal::Coverage, model);
-    let rest = goals.map(|goal| Policy::new(belief, &planners::BY_OPTIONS, goal, model));
+    let rest = goals.map(|goal| Policy::new(belief, &BY_OPTIONS, goal, model));
     std::iter::once(first).chain(rest).collect()
 }
 
@@ -83,11 +81,11 @@ mod tests {
 
     #[test]
     fn the_wildfire_ladder_has_these_policies() {
-        let policies = ladder(&Model::wildfire());
+        let policies = ladder(&Model::wildfire(), &Learned::default());
         let names: Vec<&str> = policies.iter().map(|policy| &*policy.name).collect();
-        let expected = "random_walk coverage shooting_explore shooting_normal shooting_latent shooting_exploit \
-             shooting_exploit_only beam_exploit spatial_shooting spatial_beam oracle_shooting oracle_beam oracle_ahead \
-             oracle_policy";
+        let expected = "random_walk coverage known/shooting/explore known/shooting/normal known/shooting/latent \
+             shooting known/shooting/exploit_only known/beam/exploit known+spatial+cavities/shooting/exploit beam \
+             truth/shooting/exploit oracle_beam oracle_ahead oracle_policy";
         assert_eq!(names.join(" "), expected);
     }
 

@@ -9,31 +9,32 @@ use emberwatch_model::Model;
 use emberwatch_model::built_in::listed;
 use emberwatch_model::text::shortened;
 
-/// Short names of policies, each with its parts: policies of the benchmark and the default learned policies.
+/// Short names of policies, each with its parts. A short name never changes its meaning.
 pub(super) const NAMED: &[(&str, &str)] = &[
     ("random_walk", "none/random"),
     ("coverage", "none/shooting/coverage"),
-    ("shooting_explore", "known/shooting/explore"),
-    ("shooting_exploit", "known/shooting/exploit"),
-    ("shooting_exploit_only", "known/shooting/exploit_only"),
-    ("beam_exploit", "known/beam/exploit"),
-    ("spatial_shooting", "known+spatial/shooting/exploit"),
-    ("spatial_beam", "known+spatial/beam/exploit"),
+    ("shooting", "known/shooting/exploit"),
+    ("beam", "known+spatial+cavities/beam/exploit"),
     ("learned_beam", "learned/beam/exploit"),
-    ("learned_spatial_beam", "learned+spatial/beam/exploit"),
     ("learned_policy", "learned/options/learned"),
     ("neural_beam", "neural/beam/exploit"),
     ("neural_policy", "neural/options/learned"),
-    ("autoencoder_exploit", "autoencoder/shooting/exploit"),
-    ("autoencoder_policy", "autoencoder/shooting/learned"),
-    ("oracle_shooting", "truth/shooting/exploit"),
     ("oracle_beam", "truth/beam/exploit"),
     ("oracle_ahead", "truth/ahead/exploit"),
     ("oracle_policy", "truth/options/rule"),
 ];
 
-/// Prefixes for policies whose goal is one state: `shooting_STATE` is short for `known/shooting/STATE`.
-const OF_STATE: (&str, &str) = ("shooting_", "known/shooting/");
+/// Short names of earlier versions, or their beginnings, each with its parts. They are refused.
+const FORMER: &[(&str, &str)] = &[
+    ("shooting_", "known/shooting/"),
+    ("beam_", "known/beam/"),
+    ("spatial_shooting", "known+spatial/shooting/exploit"),
+    ("spatial_beam", "known+spatial/beam/exploit"),
+    ("learned_spatial_beam", "learned+spatial/beam/exploit"),
+    ("autoencoder_exploit", "autoencoder/shooting/exploit"),
+    ("autoencoder_policy", "autoencoder/shooting/learned"),
+    ("oracle_shooting", "truth/shooting/exploit"),
+];
 
 /// Goals of all planners except `options`. The states of the model are goals as well.
 pub(super) const GOALS: &[(Goal, &str, &str)] = &[
@@ -76,13 +77,8 @@ fn name(belief: &BeliefKind, planner: &'static PlannerKind, goal: Goal, model: &
     if planner.has_goal {
         parts = format!("{parts}/{}", goal_name(planner, goal, model));
     }
-    if let Some((name, _)) = NAMED.iter().find(|(_, named)| *named == parts) {
-        return (*name).into();
-    }
-    match (parts.strip_prefix(OF_STATE.1), goal) {
-        (Some(state), Goal::State(_)) => format!("{}{state}", OF_STATE.0),
-        _ => parts,
-    }
+    let short = NAMED.iter().find(|(_, named)| *named == parts);
+    short.map_or(parts, |(name, _)| (*name).into())
 }
 
 fn goal_name(planner: &'static PlannerKind, goal: Goal, model: &Model) -> String {
@@ -164,14 +160,8 @@ type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
 /// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the states' names for
 /// error messages.
 fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Result<Parts> {
-    let mut table = NAMED.iter();
-    let parts = match table.find(|(known, _)| *known == name) {
-        Some((_, parts)) => (*parts).to_owned(),
-        None => match name.strip_prefix(OF_STATE.0) {
-            Some(of) if state(of).is_some() => format!("{}{of}", OF_STATE.1),
-            _ => name.to_owned(),
-        },
-    };
+    let short = NAMED.iter().find(|(short, _)| *short == name);
+    let parts = short.map_or(name, |(_, parts)| parts);
     let one_of = |names: &str| format!("one of {names}");
     let wrong = |what: &str, expected: &str, got: &str| {
         let (name, got) = (shortened(name), shortened(got));
@@ -181,12 +171,7 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
     let (belief, planner, goal) = match words.as_slice() {
         [belief, planner] => (*belief, *planner, None),
         [belief, planner, goal] => (*belief, *planner, Some(*goal)),
-        _ => bail!(
-            "policy: expected one of {}, or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit (see `compare \
-             --policies help`), got {:?}",
-            listed(NAMED.iter().map(|(name, _)| *name)),
-            shortened(name)
-        ),
+        _ => bail!(unknown(name)),
     };
     let mut kinds = BELIEFS.iter().copied();
     let found = kinds.find(|kind| kind.name == belief);
@@ -203,6 +188,23 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
     }
     let goal = found.ok_or_else(|| wrong("goal", &goals, goal.unwrap_or_default()))?;
     Ok((belief, planner, goal))
+}
+
+/// Returns the error for a name that is neither short nor made of parts.
+fn unknown(name: &str) -> String {
+    let mut former = FORMER.iter().filter_map(|(old, parts)| {
+        let rest = name.strip_prefix(old)?;
+        (rest.is_empty() != old.ends_with('_')).then(|| format!("{parts}{rest}"))
+    });
+    let got = shortened(name);
+    match former.next() {
+        Some(parts) => format!("policy: {got:?} is not a short name any more: use {parts}"),
+        None => format!(
+            "policy: expected one of {}, or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit (see `compare \
+             --policies help`), got {got:?}",
+            listed(NAMED.iter().map(|(name, _)| *name))
+        ),
+    }
 }
 
 /// Returns the goals that planners other than `options` accept, without the states of the model.
@@ -268,13 +270,6 @@ mod tests {
             assert_eq!(policy.name, name);
             assert_eq!(Policy::named(parts, &model).expect("the same"), policy);
         }
-        let [latent, parts] = ["shooting_latent", "known/shooting/latent"]
-            .map(|name| Policy::named(name, &model).expect("a policy"));
-        assert_eq!(latent, parts);
-        assert_eq!(
-            (&*latent.name, latent.goal),
-            ("shooting_latent", Goal::State(1))
-        );
     }
 
     #[test]
@@ -317,7 +312,7 @@ mod tests {
         let model = Model::wildfire();
         for (name, words) in [
             ("", "expected one of random_walk, coverage, "),
-            ("beam", "or BELIEF/PLANNER/GOAL such as learned+"),
+            ("rule", "or BELIEF/PLANNER/GOAL such as learned+"),
             ("knwon/beam/exploit", "belief: expected one of none, "),
             ("known/beem/exploit", "planner: expected one of random, "),
             ("known/beam/ash", ", normal, latent, fire, got \"ash\""),
@@ -325,15 +320,19 @@ mod tests {
             ("none/random/exploit", "goal: expected no goal, got \"ex"),
             ("known/beam/learned", "latent, fire, got \"learned\""),
             ("learned/beam/fire", "goal: expected one of coverage, "),
-            ("shooting_ash", "got \"shooting_ash\""),
             ("learned_", "got \"learned_\""),
-            ("beam_explore", "got \"beam_explore\""),
+            ("beam_", "got \"beam_\""),
+            (
+                "beam_exploit",
+                "\"beam_exploit\" is not a short name any more: use known/beam/exploit",
+            ),
+            ("shooting_latent", ": use known/shooting/latent"),
+            ("spatial_beam", ": use known+spatial/beam/exploit"),
         ] {
             let error = Policy::named(name, &model).expect_err(name).to_string();
             assert!(error.contains(words), "{error}");
         }
         check_name("known/beam/ash").expect("a state of some model");
-        check_name("shooting_ash").expect("a state of some model");
         assert!(check_name("bem_exploit").is_err());
     }
 }

@@ -145,9 +145,9 @@ mod tests {
     fn default_bonuses_are_the_authors_and_small_for_beam() {
         let config = AgentConfig::default();
         let [fire, entropy] = [Target::State(2), Target::Entropy].map(Objective::paper);
-        assert_eq!(objective("shooting_exploit", &config), fire);
-        assert_eq!(objective("shooting_explore", &config), entropy);
-        let of_beam = objective("beam_exploit", &config);
+        assert_eq!(objective("shooting", &config), fire);
+        assert_eq!(objective("known/shooting/explore", &config), entropy);
+        let of_beam = objective("beam", &config);
         assert_eq!(of_beam.coverage_bonus, BEAM_BONUS);
         let choices = network_choices(3);
         assert_eq!(choices[2].objective(0, &config), fire);
@@ -160,15 +160,15 @@ mod tests {
         config.objective.shooting_bonus = 3.0;
         config.objective.revisits = true;
         for (name, bonus, target) in [
-            ("shooting_explore", 3.0, Target::Entropy),
-            ("shooting_latent", 3.0, Target::State(1)),
-            ("shooting_exploit_only", 0.0, Target::State(2)),
-            ("beam_exploit", 0.02, Target::State(2)),
+            ("known/shooting/explore", 3.0, Target::Entropy),
+            ("known/shooting/latent", 3.0, Target::State(1)),
+            ("known/shooting/exploit_only", 0.0, Target::State(2)),
+            ("beam", 0.02, Target::State(2)),
             ("coverage", 1.0, Target::Coverage),
         ] {
             let got = objective(name, &config);
             assert_eq!((got.coverage_bonus, got.target), (bonus, target), "{name}");
         }
-        assert!(objective("beam_exploit", &config).revisits);
+        assert!(objective("beam", &config).revisits);
     }
 }

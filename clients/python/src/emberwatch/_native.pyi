@@ -435,9 +435,6 @@ class Recording:
     def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
         """Returns nanoseconds, kind, and a server's JSON or a sample's fields; None at the end."""
 
-def estimator_names() -> list[tuple[str, str]]:
-    """Returns the name and a description of each estimator that options can be planned with."""
-
 def checkpoint_bytes(path: str) -> bytes:
     """Returns the bytes of a checkpoint; refuses folders, pipes and files that are too large."""
 
@@ -508,8 +505,8 @@ class Estimators:
     def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]:
         """Returns log-likelihoods of frames `(n, H, W)` and numbers of observed cells, `(n,)`."""
 
-def belief_kinds() -> list[tuple[str, str]]:
-    """Returns the name and a description of each kind of belief that frames can correct."""
+def belief_kinds() -> list[tuple[str, str, bool, bool, bool]]:
+    """Returns the name of each kind of belief that frames can correct, and the fields of `Kind`."""
 
 def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
     """Returns the share of 64 simulated worlds with each cell in each state, `(S, H, W)`."""

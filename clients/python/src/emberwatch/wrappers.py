@@ -16,7 +16,7 @@ from gymnasium.core import ActType
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.belief import Belief, known, load
+from emberwatch.belief import RECOMMENDED, Belief, known, load
 from emberwatch.belief.prior import PriorKind, prior_of
 from emberwatch.common.arguments import as_json
 from emberwatch.common.paths import absolute
@@ -27,7 +27,7 @@ from emberwatch.model import Model
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
     """Observes a belief about an environment's world instead of its frames.
 
-    By default the belief is the Bayes filter of the environment's model. The wrapper is for single
+    By default the belief is the recommended one of the environment's model. The wrapper is for single
     environments; wrap the environments of a vector one by one. `terminated` and `truncated` pass
     through, and only `reset` resets the belief.
 
@@ -68,7 +68,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     - `prior`: one of the priors above.
     - `model`: a `Model`, its name, or the path or the text of its file. The default is
       ``env.unwrapped.model``. It is needed only for servers that do not reveal their model.
-    - `kind`: the kind of belief, a key of `emberwatch.belief.kinds`.
+    - `kind`: the kind of belief, a key of `emberwatch.belief.kinds`. The default is the kind of the
+      checkpoint, or `emberwatch.belief.RECOMMENDED`. ``"known"`` is the paper's filter.
     - `checkpoint`: a file written by `emberwatch-agent train`. The belief is then the one that
       `emberwatch.belief.load` returns, with its own prior and S. A checkpoint needs no model.
     """
@@ -104,7 +105,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             burn_in = int(getattr(env.unwrapped, "burn_in", 0))
             known_model = _model_of(env, model)
             first = prior_of(prior, known_model, **grid, burn_in=burn_in)
-            self._belief = known(known_model, prior=first, kind="known" if kind is None else kind)
+            self._belief = known(known_model, prior=first, kind=kind or RECOMMENDED)
         elif prior is not None:
             raise invalid(
                 "prior", "None with a checkpoint, which has its own prior", repr_of(prior)

@@ -89,7 +89,7 @@ fn every_policy_plans_on_the_configured_belief() {
         target: 1,
     });
     for policy in [
-        "shooting_exploit",
+        "shooting",
         "known/options/entropy",
         "oracle_ahead",
         "learned_beam",
@@ -123,7 +123,7 @@ fn decisions_use_the_belief_that_they_were_learned_with() {
         let (other, mut learned) = (config(other), Learned::default());
         learned.put(network(basis, |_| true));
         learned.put(decisions(basis));
-        for policy in ["autoencoder_policy", "known/options/learned"] {
+        for policy in ["autoencoder/shooting/learned", "known/options/learned"] {
             assert_eq!(plans(policy, &other, &learned), expected, "{policy}");
         }
         let error = agent("known+spatial/options/learned", &other, &learned).err();
@@ -168,7 +168,7 @@ fn a_network_decides_from_the_hidden_vector_after_the_frame() {
     let expected = network_choices(3)[best].objective(0, &config).target;
     let mut learned = Learned::default();
     learned.put(network);
-    let mut agent = agent("autoencoder_policy", &config, &learned).expect("an agent");
+    let mut agent = agent("autoencoder/shooting/learned", &config, &learned).expect("an agent");
     agent.correct(&world(0).1, None).expect("possible");
     agent.predict();
     agent.plan(&[ROBOT], 0);

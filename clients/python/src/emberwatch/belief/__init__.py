@@ -16,7 +16,9 @@ Beliefs have shape (S, H, W) with S states: a distribution in each cell.
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.belief.estimators import RECOMMENDED as RECOMMENDED
 from emberwatch.belief.estimators import Belief as Belief
+from emberwatch.belief.estimators import Kind as Kind
 from emberwatch.belief.estimators import kinds as kinds
 from emberwatch.belief.estimators import known as known
 from emberwatch.belief.estimators import load as load

@@ -5,7 +5,7 @@
 
 from os import PathLike
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,16 +23,33 @@ _Number = TypeVar("_Number", np.float32, np.float64)
 _MAX_WORLDS = 1 << 20
 
 
-def kinds() -> dict[str, str]:
-    """Returns the kinds of belief, such as ``"known"`` and ``"learned"``, with descriptions."""
-    return dict(_native.belief_kinds())
+#: The default kind where a model is known; ``"known"`` is the paper's filter.
+RECOMMENDED: Final = _native.RECOMMENDED
+
+
+class Kind(NamedTuple):
+    """The properties of a kind of belief."""
+
+    #: Short description.
+    about: str
+    #: Whether it uses the worlds' model.
+    knows_model: bool
+    #: Whether `load` makes it, from a checkpoint, instead of `known`.
+    needs_checkpoint: bool
+    #: Whether `WildfireObjectiveEnv` can plan on it.
+    has_options: bool
+
+
+def kinds() -> dict[str, Kind]:
+    """Returns the kinds of belief, such as ``"known"`` and ``"learned"``."""
+    return {name: Kind(*facts) for name, *facts in _native.belief_kinds()}
 
 
 def known(
     model: Model | str | Path,
     *,
     prior: ArrayLike,
-    kind: str = "known",
+    kind: str = RECOMMENDED,
     n_worlds: int | None = None,
 ) -> "Belief":
     """Makes a belief that predicts with a known model.
@@ -42,8 +59,8 @@ def known(
         prior: The belief before the first frame: a distribution over the states in each cell, shape
             (S, H, W), from `initial_prior` or `prior.simulated_prior` for example. It is stored in
             single precision.
-        kind: A kind of `kinds` whose name starts with ``"known"``. The plain ``"known"`` is the
-            paper's Bayes filter. With `+cavities`, it predicts models of hazards more accurately.
+        kind: A kind of `kinds` that needs no checkpoint. ``"known"`` is the paper's Bayes filter.
+            With `+cavities`, it predicts models of hazards more accurately.
             With `+spatial`, a frame also corrects the neighbours of the observed cells.
         n_worlds: Number of worlds, at least 1. None: a single world, and arrays without an axis
             for worlds.

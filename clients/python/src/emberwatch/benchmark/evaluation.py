@@ -119,7 +119,7 @@ def evaluate(
     parts = set(names_of(keywords.get("observation")))
     columns = {
         "policy": name,
-        "estimator": estimator or ("known" if OF_BELIEF & parts else "none"),
+        "estimator": estimator or (keywords.get("kind", "known") if OF_BELIEF & parts else "none"),
         "robots": n_robots,
         "team": "shared" if n_robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,

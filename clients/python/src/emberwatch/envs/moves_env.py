@@ -101,6 +101,7 @@ class WildfireMovesEnv(WorldEnv):
     * `observation`: `("frame", "visited", "robot", "move")` by default.
     * `reward`: may also be `"move"`.
     * `window`: L, the side of `local` and `recent` in cells, an odd number (15).
+    * `kind`: the kind of belief in `belief` and `local`.
 
     ## Vectorized environment
 
@@ -118,6 +119,7 @@ class WildfireMovesEnv(WorldEnv):
         observation: MovesParts = ("frame", "visited", "robot", "move"),
         reward: MovesReward = "share",
         window: int = WINDOW,
+        kind: str = "known",
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
@@ -125,7 +127,7 @@ class WildfireMovesEnv(WorldEnv):
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
         super().__init__(Session(settings))
         self._flights = flights = flights_of(self._spec, 1, pays=reward == "move")
-        self._observations = Observations(observation, self._session, flights, window)
+        self._observations = Observations(observation, self._session, flights, window, kind)
         self._seen_teams: StepAnswer | None = None
         self.observation_space = self._observations.space
         self.action_space = spaces.Discrete(wire.N_MOVES)
@@ -238,6 +240,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         observation: MovesParts = ("frame", "visited", "robot", "move"),
         reward: MovesReward = "share",
         window: int = WINDOW,
+        kind: str = "known",
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
@@ -246,7 +249,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         session = vector_session(settings, num_envs)
         n_rows = session.n_rows
         self._flights = flights = flights_of(session.spec, n_rows, pays=reward == "move")
-        self._parts = Observations(observation, session, flights, window)
+        self._parts = Observations(observation, session, flights, window, kind)
         super().__init__(
             session,
             self._parts,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_choice, as_choices
 from emberwatch.envs.base import ONE_ROW, WorldEnv
-from emberwatch.envs.plans import Estimator, FirstBelief, Plans, PlansOwner
+from emberwatch.envs.plans import FirstBelief, Plans, PlansOwner
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
@@ -54,16 +54,10 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     As in `WildfireEnv` without `observation`, `reward` and `robot`, for worlds of one robot. Also:
 
-    * `estimator`: the kind of belief. The default is the kind that `checkpoint` contains, or
-      `"known"` without a checkpoint. If fires are rare, learned estimators find several times
-      as many burning cells as estimators with a known model.
-        * `"known"`: the Bayes filter with the true model
-        * `"known+spatial"`: known, where observations also correct neighbouring cells
-        * `"known+cavities"`: known; with hazards, without a cell's influence on itself
-        * `"known+spatial+cavities"`: known+spatial, predicting like known+cavities
-        * `"learned"`: a Bayes filter with learned parameters
-        * `"learned+spatial"`: learned, where observations also correct neighbouring cells
-        * `"neural"`: a learned network that predicts observations from the last ones
+    * `estimator`: the kind of belief, one that `emberwatch.belief.kinds` lists with `has_options`.
+      The default is the kind that `checkpoint` contains, or `emberwatch.belief.RECOMMENDED` without
+      a checkpoint. If fires are rare, learned estimators find several times as many burning cells
+      as estimators with a known model.
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; its
       first computation takes about a second), `"initial"` or `"uniform"`.
@@ -86,7 +80,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     def __init__(
         self,
         *,
-        estimator: Estimator | None = None,
+        estimator: str | None = None,
         checkpoint: str | PathLike[str] | None = None,
         prior: FirstBelief = "simulated",
         **world: Unpack[WorldArguments],
@@ -158,7 +152,7 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
         num_envs: int = 1,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        estimator: Estimator | None = None,
+        estimator: str | None = None,
         checkpoint: str | PathLike[str] | None = None,
         prior: FirstBelief = "simulated",
         **world: Unpack[WorldArguments],

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch._native import Flights, Windows
-from emberwatch.belief import Belief, known
+from emberwatch.belief import Belief, kinds, known
 from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
 from emberwatch.common.arguments import as_integer
@@ -47,6 +47,7 @@ class Observations:
         session: Session,
         flights: Flights | None = None,
         window: int = WINDOW,
+        kind: str = "known",
     ) -> None:
         """Checks the parts and makes their spaces.
 
@@ -69,6 +70,10 @@ class Observations:
             if spec.is_recorded:
                 needs = "simulated worlds, as recorded ones have no model"
             raise InvalidArgumentError(f"observation: expected {needs}, for parts with a belief")
+        known_kinds = [name for name, it in kinds().items() if not it.needs_checkpoint]
+        if kind not in known_kinds:
+            raise invalid("kind", f"one of {', '.join(known_kinds)}", repr_of(kind))
+        self._kind = kind
         #: The space of one robot's observation.
         self.space = (
             known[names[0]]
@@ -234,7 +239,7 @@ class Observations:
         assert spec.model is not None
         grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
         prior = prior_of(None, spec.model, **grid)
-        return known(spec.model, prior=prior, n_worlds=self._n_rows)
+        return known(spec.model, prior=prior, kind=self._kind, n_worlds=self._n_rows)
 
     def _show(self, rows: NDArray[np.bool_]) -> None:
         """Updates the beliefs and windows of `rows`, in which a new path begins."""

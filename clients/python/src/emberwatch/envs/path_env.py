@@ -58,9 +58,10 @@ class WildfireEnv(WorldEnv):
 
     The last channel of `image` is for unobserved cells. With a `sensor_radius` of r, or a sensor in
     the model file, the robot also observes cells up to r rows and columns away from its path. O is
-    the number of the model's observations. `belief` is the known model's Bayes filter (paper
-    equations 5 and 6): the distribution of the state that the next path will observe, given all
-    frames so far. Its prior is the default of `wrappers.BeliefObservation`.
+    the number of the model's observations. `belief` is the distribution of the state that the next
+    path will observe, given all frames so far: by default of the known model's Bayes filter (paper
+    equations 5 and 6), otherwise of another `kind`. Its prior is the default of
+    `wrappers.BeliefObservation`.
 
     ## Rewards
 
@@ -111,6 +112,8 @@ class WildfireEnv(WorldEnv):
 
     * `observation`: the parts of the observation (`("frame", "robot")`).
     * `reward`: `"share"`, `"team"` or `"marginal"` (`"share"`).
+    * `kind`: the kind of belief in the part `belief`, one of `emberwatch.belief.kinds` that needs
+      no checkpoint (`"known"`, the paper's filter).
     * `instance`: the running server to attach to. None: simulate the world in this process. The
       results are byte for byte the same either way.
     * `world`: with `instance`, the number of the server's world (0).
@@ -150,13 +153,14 @@ class WildfireEnv(WorldEnv):
         *,
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
+        kind: str = "known",
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
         settings = Settings.of(WildfireEnv, world)
         self._pays = check_reward(reward)
         super().__init__(Session(settings))
-        self._observations = Observations(observation, self._session)
+        self._observations = Observations(observation, self._session, kind=kind)
         self.observation_space = self._observations.space
         self.action_space = spaces.MultiDiscrete([wire.N_MOVES] * self._spec.n_moves)
 
@@ -245,6 +249,7 @@ class WildfireVectorEnv(WorldVectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
+        kind: str = "known",
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
@@ -253,7 +258,7 @@ class WildfireVectorEnv(WorldVectorEnv):
         session = vector_session(settings, num_envs)
         super().__init__(
             session,
-            Observations(observation, session),
+            Observations(observation, session, kind=kind),
             spaces.MultiDiscrete([wire.N_MOVES] * session.spec.n_moves),
             pays=pays,
             max_episode_steps=max_episode_steps,

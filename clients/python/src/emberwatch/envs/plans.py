@@ -13,15 +13,6 @@ from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
 
-Estimator: TypeAlias = Literal[
-    "known",
-    "known+spatial",
-    "known+cavities",
-    "known+spatial+cavities",
-    "learned",
-    "learned+spatial",
-    "neural",
-]
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
 _NAMES: Final = _native.option_names()
@@ -39,7 +30,7 @@ class Plans:
     def __init__(
         self,
         session: Session,
-        estimator: Estimator | None,
+        estimator: str | None,
         checkpoint: str | PathLike[str] | None,
         prior: FirstBelief,
     ) -> None:
