@@ -20,7 +20,7 @@ def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
     look.wait_for_steps()
     task = look.page.locator("#task")
     look.eventually(lambda: task.text_content() == "task small", "the task's name")
-    look.eventually(lambda: look.text("policy") == "known/beam/exploit", "a policy")
+    look.eventually(lambda: look.text("policy") == "beam", "a policy")
     look.eventually(lambda: look.number("holder") > 0, "a holder")
     look.eventually(lambda: look.number("step") > 0, "a step")
     look.eventually(lambda: look.number("observers") >= 1, "an observer")
@@ -147,9 +147,9 @@ def test_a_server_that_is_killed_is_waited_for_whatever_its_grid(watched, progra
 
 def test_another_agent_takes_over(watched, programs):
     server, look = watched.server, watched.look
-    look.eventually(lambda: look.text("policy") == "known/beam/exploit", "the first policy")
-    programs.agent(server.instance, policy="known/shooting/explore", takeover=True)
-    look.eventually(lambda: look.text("policy") == "known/shooting/explore", "the new policy")
+    look.eventually(lambda: look.text("policy") == "beam", "the first policy")
+    programs.agent(server.instance, policy="shooting", takeover=True)
+    look.eventually(lambda: look.text("policy") == "shooting", "the new policy")
     look.eventually(lambda: look.text("objective") == "entropy", "what its first path is for")
 
 

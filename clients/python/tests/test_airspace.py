@@ -230,7 +230,7 @@ def test_the_filter_uses_maps(tmp_path: Path) -> None:
     model, expected = Model.named(path), oracle.parameters(land.HAZARDS, maps)
     belief = np.moveaxis(rng.dirichlet(np.ones(3), SHAPE), -1, 0)
     frame = rng.choice(np.array([*range(3), 255], np.uint8), SHAPE)
-    kept = known(model, prior=belief)
+    kept = known(model, prior=belief, kind="known")
     kept.correct(frame)
     posterior = kept.belief
     np.testing.assert_allclose(posterior, oracle.bayes(expected, belief, frame), atol=1e-6)

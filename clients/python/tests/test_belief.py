@@ -54,7 +54,7 @@ def assert_near(got: NDArray, expected: NDArray, tolerance: float) -> None:
 def test_beliefs_equal_the_authors_numbers() -> None:
     file = golden("a3_bayes")
     saved = file["7x4_saved_steps"].tolist()
-    filter = known(WILDFIRE, prior=uniform_prior(WILDFIRE, height=7, width=4))
+    filter = known(WILDFIRE, prior=uniform_prior(WILDFIRE, height=7, width=4), kind="known")
     for step, frame in enumerate(file["7x4_obs"]):
         filter.correct(frame)
         posterior = np.moveaxis(filter.belief, 0, -1)
@@ -84,7 +84,7 @@ def test_beliefs_equal_the_oracle_and_stay_on_the_simplex(
 ) -> None:
     rng = np.random.default_rng(key)
     prior = initial_prior(model, height=height, width=width)
-    filter, parameters = known(model, prior=prior), oracle.parameters(model.toml)
+    filter, parameters = known(model, prior=prior, kind="known"), oracle.parameters(model.toml)
     for _ in range(5):
         frame = rng.integers(0, model.n_observations, (height, width)).astype(np.uint8)
         frame[rng.random((height, width)) < 0.5] = UNOBSERVED

@@ -166,8 +166,8 @@ def test_unsuitable_environments_are_refused() -> None:
 
 def test_it_observes_other_kinds_of_belief(tmp_path: Path) -> None:
     stub = Stub()
-    env = BeliefObservation(stub, kind="known+spatial")
-    expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID), kind="known+spatial")
+    env = BeliefObservation(stub, kind="known")
+    expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID), kind="known")
     for seed in (1, 2):
         env.reset(seed=seed)
         expected.reset()

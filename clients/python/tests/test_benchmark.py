@@ -108,7 +108,8 @@ def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
 
 
 def test_a_row_names_the_estimator_of_the_belief() -> None:
-    for changes, expected in (({}, "known"), ({"estimator": "mine"}, "mine")):
+    of_kind = {"kind": "known+spatial"}, "known+spatial"
+    for changes, expected in (({}, "known"), of_kind, ({"estimator": "mine"}, "mine")):
         assert {row.estimator for row in score(observation="local", **changes)} == {expected}
     assert {row.estimator for row in score()} == {"none"}
 

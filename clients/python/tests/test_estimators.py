@@ -27,8 +27,8 @@ MODEL = Model.named("wildfire-small")
 GRID = {"height": 16, "width": 16}
 PRIOR = simulated_prior(MODEL, **GRID, burn_in=100)
 N_WORLDS = 3
-KNOWN = [name for name in belief.kinds() if name.startswith("known")]
-LEARNED = [name for name in belief.kinds() if name.startswith("learned")]
+KNOWN = [name for name, kind in belief.kinds().items() if not kind.needs_checkpoint]
+LEARNED = ["learned", "learned+spatial"]
 
 #: Kinds of belief, with a checkpoint for the learned kinds.
 CASES: list[tuple[str, str | None]] = [
@@ -364,7 +364,7 @@ def test_the_readme_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     lines = [line for line in section.splitlines() if line.startswith("    ") or not line]
     exec(compile(textwrap.dedent("\n".join(lines)), "README.md", "exec"), {})
     printed = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in printed] == ["known", "known+spatial"]
+    assert [line.split()[0] for line in printed] == ["known", belief.RECOMMENDED]
 
 
 @pytest.mark.parametrize("name", ["wildfire-burnout", "road-ice", "wildfire-terrain"])

@@ -68,11 +68,10 @@ def make_vec(name, n, **keywords):
     return lambda: gymnasium.make_vec(f"emberwatch/{name}", num_envs=n, **WORLD, **keywords)
 
 CASES = {
-    **{kind: (known(kind, 2), believe) for kind in belief.kinds() if kind.startswith("known")},
-    **{kind: (load("learned_filter", kind, 2), believe)
-       for kind in belief.kinds() if kind.startswith("learned")},
-    **{kind: (load("neural_belief", kind, 1), believe)
-       for kind in belief.kinds() if kind.startswith("neural")},
+    **{name: (known(name, 2), believe)
+       for name, kind in belief.kinds().items() if not kind.needs_checkpoint},
+    **{name: (load("learned_filter", name, 2), believe) for name in ("learned", "learned+spatial")},
+    **{name: (load("neural_belief", name, 1), believe) for name in ("neural", "neural+sensor")},
     "neural, many worlds": (load("neural_belief", "neural", 40, 16), believe),
     "autoencoder": (load("autoencoder", None, 2), believe),
     "beam_search": (lambda: 50, plan),

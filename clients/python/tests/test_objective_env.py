@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 import subprocess
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import environments
 import golden_options
@@ -20,8 +19,7 @@ from gymnasium.utils.env_checker import check_env
 from processes import eventually, find, server
 
 import emberwatch
-from emberwatch import _native, errors
-from emberwatch.envs.plans import Estimator
+from emberwatch import belief, errors
 
 GOLDEN = np.load(golden_options.FILE)
 
@@ -48,7 +46,7 @@ def decide(env: Any) -> Any:
     return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
 
 
-@pytest.mark.parametrize("keywords", [{}, {"truth": True, "estimator": "known+spatial"}])
+@pytest.mark.parametrize("keywords", [{}, {"truth": True, "estimator": "known"}])
 def test_the_environment_checker_passes(keywords: dict[str, Any]) -> None:
     env = make(render_mode="rgb_array", **keywords)
     with environments.no_warnings():
@@ -72,14 +70,8 @@ def test_actions_and_features_have_names(env: Any) -> None:
     assert np.allclose(named["n_paths"], 1 / 200)
 
 
-def test_types_docs_and_errors_list_the_same_estimators() -> None:
-    estimators = _native.estimator_names()
-    names = [name for name, _ in estimators]
-    assert list(get_args(Estimator)) == names
-    lines = [f'* `"{name}"`: {about}' for name, about in estimators]
-    document = inspect.getdoc(emberwatch.WildfireObjectiveEnv)
-    assert document is not None
-    assert re.findall(r'\* `".*', document) == lines
+def test_an_unknown_estimator_is_refused_with_the_kinds_that_have_options() -> None:
+    names = [name for name, kind in belief.kinds().items() if kind.has_options]
     with refuses(re.escape(f"estimator: expected one of {', '.join(names)}, got")):
         make(estimator="truth")
 
@@ -170,7 +162,7 @@ def test_beliefs_are_published_to_readers() -> None:
             envs.step(np.array([0, 3]))
             outlook = reader.receive(0.0)
             if outlook is not None:
-                assert (outlook.policy, outlook.belief_from) == ("options", "known")
+                assert (outlook.policy, outlook.belief_from) == ("options", belief.RECOMMENDED)
                 assert outlook.robots == range(outlook.world, outlook.world + 1)
                 expected.discard((outlook.world, outlook.objective))
             return not expected
@@ -186,7 +178,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(checkpoints: Path, tmp_path: 
             with refuses("checkpoint: expected the world's 4 observations, got 3"):
                 maker(checkpoint=checkpoints / name, model=model)
     # An estimator that knows the model ignores learned filters.
-    known = make(checkpoint=checkpoints / "learned_filter", estimator="known")
+    known = make(checkpoint=checkpoints / "learned_filter", estimator=belief.RECOMMENDED)
     assert np.array_equal(known.reset(seed=1000)[0], make().reset(seed=1000)[0])
 
 
@@ -199,7 +191,7 @@ def test_recorded_worlds_need_a_learned_belief(tmp_path: Path) -> None:
     env: Any = closed_later(gymnasium.make(OBJECTIVE, checkpoint=checkpoint, **world))
     env.reset(seed=1000)
     assert env.step(0)[4]["step"] == 1
-    with refuses("model: expected a model for the estimator 'known'.*got recorded worlds"):
+    with refuses("model: expected a model for the estimator 'known.*'.*got recorded worlds"):
         gymnasium.make(OBJECTIVE, **world)
 
 
@@ -225,17 +217,17 @@ def test_resume_after_an_unfinished_step_has_all_frames(
 
 
 def test_the_exploit_option_flies_like_the_exploit_policy() -> None:
-    belief, found = "known+spatial", list[Any]()
+    found = list[Any]()
     for flies in (False, True):
         started = server(seed=1000, height=16, width=12, moves=8, burn_in=300)
         client = started.connect()
         if flies:
-            env = make(instance=started.instance, estimator=belief)
+            env = make(instance=started.instance, estimator=belief.RECOMMENDED)
             env.reset(options={"resume": True})
             for _ in range(5):
                 env.step(0)
         else:
-            policy = f"{belief}/options/exploit"
+            policy = f"{belief.RECOMMENDED}/options/exploit"
             flags = ["--instance", started.instance, "--policy", policy, "--steps", "5"]
             command = [find("emberwatch-agent"), "run", "--prior", "initial", *flags]
             subprocess.run(command, check=True, capture_output=True, timeout=60)
@@ -255,7 +247,7 @@ def test_waiting_for_truth_ends_at_the_timeout() -> None:
 
 def test_a_hidden_model_must_be_passed() -> None:
     instance = server(reveal_model=False).instance
-    with refuses("model: expected a model for the estimator 'known', or a checkpoint"):
+    with refuses("model: expected a model for the estimator 'known.*', or a checkpoint"):
         make(instance=instance)
     env = make(instance=instance, model="wildfire")
     env.reset(seed=1000)

@@ -45,12 +45,12 @@ def test_an_image_has_one_channel_per_value() -> None:
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
 def test_the_belief_part_is_the_filters_prediction(name: str) -> None:
-    env, filtered = make(name, observation="belief"), BeliefObservation(make(name))
+    env, filtered = make(name, observation="belief"), BeliefObservation(make(name), kind="known")
     seen = [env.reset(seed=5)[0], *(env.step(action)[0] for action in actions(env, 9))]
     filtered.reset(seed=5)
     for number, action in enumerate(actions(env, 9), 1):
         posterior = filtered.step(action)[0]
-        predictor = known(filtered.unwrapped.model, prior=posterior)
+        predictor = known(filtered.unwrapped.model, prior=posterior, kind="known")
         predictor.predict()
         assert np.array_equal(seen[number], np.rint(255 * predictor.belief.transpose(1, 2, 0)))
     assert not np.array_equal(seen[0], seen[9])

@@ -200,7 +200,7 @@ pub fn outlook_seeds() -> Vec<Seed> {
         ..AgentHeader::default()
     };
     let intent = Intent {
-        policy: "known/beam/exploit".into(),
+        policy: "beam".into(),
         states: vec!["normal".into(), "fire".into()],
         ..Intent::default()
     };

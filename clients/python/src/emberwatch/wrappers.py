@@ -43,8 +43,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     moves the world from ``X_k`` to ``X_{k+1}``, and its frame shows ``X_{k+1}``. The filter
     predicts, then corrects. The observation is the posterior about ``X_{k+1}``, given all frames
     (eqs. 5 and 6), with the same numbers as the Rust agent's. The agent plans on the predictor, the
-    belief about the state that the next path will observe. To compute it from this observation,
-    call `predict` on ``emberwatch.belief.known(model, prior=observation)``.
+    belief about the state that the next path will observe. To compute it from an observation of the
+    kind ``"known"``, call `predict` on ``emberwatch.belief.known(model, prior=observation,
+    kind="known")``.
 
     - ``dtype="float32"``: a `Box` of 0 to 1, shape (S, H, W). The S numbers of a cell sum to 1.
     - ``dtype="uint8"``: the same numbers times 255, rounded, shape (H, W, S). This is an image for

@@ -62,6 +62,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         reward: MovesReward = "share",
         max_episode_steps: int | Literal["task"] | None = "task",
         window: int | None = None,
+        kind: str = "known",
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. Worlds are created or acquired at the first reset."""
@@ -69,7 +70,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             raise invalid("action", "'move' or 'path'", repr_of(action))
         if world.get("instance") is None and world.get("task") is None:
             world.setdefault("robots", 2)
-        keywords: dict[str, Any] = {"reward": reward, **world}
+        keywords: dict[str, Any] = {"reward": reward, "kind": kind, **world}
         keywords["observation"] = _OBSERVATIONS[action] if observation is None else observation
         if window is not None:
             keywords["window"] = window
