@@ -350,7 +350,8 @@ fn flown_by(parts: &[Range<u32>], team: &str) -> (Vec<Vec<Vec<u8>>>, f64) {
     let frames = Observer::frames(&server.instance).expect("the channel");
     let start = |robots: &Range<u32>| {
         let robots = format!("--robots {}..{}", robots.start, robots.end);
-        let flags = format!("--steps {N_STEPS} --policy known/beam/exploit --takeover --team {team}");
+        let flags =
+            format!("--steps {N_STEPS} --policy known/beam/exploit --takeover --team {team}");
         Program::agent(&server.instance, &format!("{robots} {flags}"))
     };
     let agents: Vec<_> = parts.iter().map(start).collect();

@@ -19,7 +19,7 @@ use std::time::Duration;
 pub enum Worlds {
     Attached {
         instance: Instance,
-        connection: Connection,
+        connection: Box<Connection>,
         /// `None` if hidden states are not needed or not published.
         truth: Option<TruthFeed>,
     },
@@ -41,7 +41,7 @@ impl Worlds {
         Ok(Self::Attached {
             instance: instance.clone(),
             truth: truth.transpose()?,
-            connection,
+            connection: Box::new(connection),
         })
     }
 

@@ -82,7 +82,7 @@ impl RunCommand {
         );
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
-            task: self.task.as_ref().map(task_with_model).transpose()?,
+            task: self.task.as_deref().map(task_with_model).transpose()?,
             world: self.world,
             robots: self.robots.clone(),
             team: self.team,
@@ -108,9 +108,9 @@ impl RunCommand {
 }
 
 /// Returns the task, with its model unless the task is recorded.
-fn task_with_model(task: &String) -> Result<(Task, Option<Model>)> {
+fn task_with_model(task: &str) -> Result<(Task, Option<Model>)> {
     let settings = ServerConfig {
-        task: task.clone(),
+        task: task.into(),
         ..ServerConfig::default()
     };
     let settings = settings.check()?;

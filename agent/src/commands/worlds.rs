@@ -80,7 +80,7 @@ pub struct SimulationFlags {
 pub enum Source {
     Server(Instance),
     /// Settings of worlds to simulate, and the model with which beliefs predict recorded states, if one was given.
-    Settings(Box<Checked>, Option<Model>),
+    Settings(Box<Checked>, Option<Box<Model>>),
 }
 
 impl SimulationFlags {
@@ -141,7 +141,7 @@ impl WorldFlags {
         checked.config.seed = seeds.start;
         let n_worlds = (seeds.end - seeds.start).min(MAX_BATCH.into());
         let checked = checked.with_worlds(n_worlds as u32)?;
-        Ok(Source::Settings(Box::new(checked), known))
+        Ok(Source::Settings(Box::new(checked), known.map(Box::new)))
     }
 
     /// Returns the seeds to compare on.
@@ -182,7 +182,7 @@ impl Source {
     pub fn model(&self) -> Option<&Model> {
         match self {
             Self::Server(_) => None,
-            Self::Settings(checked, known) if checked.recorded.is_some() => known.as_ref(),
+            Self::Settings(checked, known) if checked.recorded.is_some() => known.as_deref(),
             Self::Settings(checked, _) => Some(&checked.model),
         }
     }
@@ -196,7 +196,7 @@ impl Source {
             Self::Server(instance) => Arena::open(Worlds::attach(&instance, true)?, n_seeds),
             Self::Settings(checked, known) => {
                 let mut arena = Arena::open(Worlds::simulate(*checked)?, n_seeds)?;
-                known.map_or(Ok(()), |model| arena.know(model))?;
+                known.map_or(Ok(()), |model| arena.know(*model))?;
                 Ok(arena)
             }
         }
