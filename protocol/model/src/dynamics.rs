@@ -2,7 +2,7 @@
 //!
 //! The result depends only on the model, the seed and the step, not on threads, platform or observers.
 //!
-//! [`ratio`] draws by the paper's rule, and [`hazards`] by that of models of hazards.
+//! `ratio` draws by the paper's rule, and `hazards` by that of models of hazards.
 //!
 //! # Random numbers
 //! Two words of the step's ChaCha8 stream are the keys of two SplitMix64 generators, as for sensor noise. One generates

@@ -1,7 +1,7 @@
 //! The prediction of one world's next states from the belief about its current ones (eq. 6).
 //!
 //! The filter assumes that cells are independent. A model with the paper's rule is predicted by eqs. 2 and 3, applied to
-//! the neighbours' mean weights. A model of hazards is predicted exactly under the assumption ([`hazards`]).
+//! the neighbours' mean weights. A model of hazards is predicted exactly under the assumption.
 
 mod hazards;
 mod lanes;

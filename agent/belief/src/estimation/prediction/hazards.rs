@@ -6,7 +6,8 @@
 //!
 //! `S_k = (1 - b_k) prod_l (1 - sum_n p_k[n, l] mu_l[n])`, with the belief `mu_l` about neighbour `l`.
 //!
-//! Transition `k` is then the next one with probability `S_{k-1} - S_k`. This is exact under the assumption.
+//! Transition `k` is then the next one with probability `S_{k-1} - S_k`. This is exact under the assumption. The code
+//! computes `1 - S_k` instead of `S_k`, because `S_k` of a rare transition is 1 in single precision.
 //!
 //! **Echo.** A cell changes its neighbours, and the changed beliefs about them change the cell's next prediction, as if
 //! they were new evidence. Dynamic message passing (Karrer and Newman 2010; Lokhov et al. 2014) avoids this echo. It
@@ -15,7 +16,7 @@
 //! cell is predicted from its neighbours' cavities, which do not contain its own influence. If neighbours have an
 //! influence in several current states, only the state with the most influence is treated as susceptible.
 
-use super::lanes::{LANES, Lanes, add, add_product, lanes_from, multiply};
+use super::lanes::{LANES, Lanes, add, add_product, lanes_from};
 use super::padded::PaddedBeliefs;
 use super::planes::Planes;
 use crate::estimation::belief::Belief;
@@ -51,7 +52,7 @@ pub struct HazardPrediction {
 struct Change {
     /// The next state by transition `k`.
     to: usize,
-    /// `1 - b_k`.
+    /// `b_k`.
     base: Values,
     /// The neighbours that can cause one of the transitions, in ascending order. Empty if they and their probabilities
     /// are those of the transitions before.
@@ -79,12 +80,12 @@ struct Work {
     next: Vec<Lanes>,
     /// The same for each cavity, as `[cavity][state]`.
     next_cavities: Vec<Lanes>,
-    /// For each cavity, the product of the other neighbours' factors.
+    /// For each cavity, the probability that the other neighbours cause one of the transitions.
     rest: Vec<Lanes>,
-    /// For each cavity, the probability that no transition so far happens.
+    /// For each cavity, the probability of one of the transitions so far.
     last: Vec<Lanes>,
-    /// The factor of each neighbour.
-    factors: Vec<Lanes>,
+    /// For each neighbour, the probability that it causes one of the transitions.
+    by_neighbour: Vec<Lanes>,
 }
 
 impl HazardPrediction {
@@ -130,7 +131,7 @@ impl HazardPrediction {
                 next_cavities: lanes(n_cavities * n_states),
                 rest: lanes(n_cavities),
                 last: lanes(n_cavities),
-                factors: lanes(n_cavities),
+                by_neighbour: lanes(n_cavities),
             },
         }
     }
@@ -176,33 +177,33 @@ impl HazardPrediction {
         for (own, changes) in changes.iter().enumerate() {
             let has_cavities = self.susceptible == Some(own);
             let here = *self.belief(n_cavities, own, place);
-            let (mut product, mut last) = ([1.0; LANES], [1.0; LANES]);
+            let (mut by_neighbours, mut last) = ([0.0; LANES], [0.0; LANES]);
             if has_cavities {
-                self.work.rest.fill([1.0; LANES]);
-                self.work.last.fill([1.0; LANES]);
+                self.work.rest.fill([0.0; LANES]);
+                self.work.last.fill([0.0; LANES]);
             }
             for change in changes {
                 if !change.neighbours.is_empty() {
-                    product = self.multiply(change, place, has_cavities);
+                    by_neighbours = self.by_neighbours(change, place, has_cavities);
                 }
-                let mut none = product;
-                change.base.multiply(&mut none, place);
-                add_difference(&mut self.work.next[change.to], &here, &last, &none);
+                let mut any = by_neighbours;
+                change.base.or(&mut any, place);
+                add_difference(&mut self.work.next[change.to], &here, &any, &last);
                 for cavity in 0..n_cavities {
                     let here = *self.belief(cavity, own, place);
                     let to = cavity * self.n_states + change.to;
                     if has_cavities {
-                        let mut none = self.work.rest[cavity];
-                        change.base.multiply(&mut none, place);
-                        let last = std::mem::replace(&mut self.work.last[cavity], none);
-                        add_difference(&mut self.work.next_cavities[to], &here, &last, &none);
+                        let mut any = self.work.rest[cavity];
+                        change.base.or(&mut any, place);
+                        let last = std::mem::replace(&mut self.work.last[cavity], any);
+                        add_difference(&mut self.work.next_cavities[to], &here, &any, &last);
                     } else {
-                        add_difference(&mut self.work.next_cavities[to], &here, &last, &none);
+                        add_difference(&mut self.work.next_cavities[to], &here, &any, &last);
                     }
                 }
-                last = none;
+                last = any;
             }
-            add_product(&mut self.work.next[own], &here, &last);
+            add_difference(&mut self.work.next[own], &here, &[1.0; LANES], &last);
             for cavity in 0..n_cavities {
                 let here = *self.belief(cavity, own, place);
                 let last = if has_cavities {
@@ -211,59 +212,57 @@ impl HazardPrediction {
                     &last
                 };
                 let to = cavity * self.n_states + own;
-                add_product(&mut self.work.next_cavities[to], &here, last);
+                add_difference(&mut self.work.next_cavities[to], &here, &[1.0; LANES], last);
             }
         }
     }
 
-    /// Returns the product of all neighbours' factors. With cavities, also computes for each neighbour the product of
-    /// the others, given that the neighbour is susceptible.
+    /// Returns the probability that neighbours cause one of the transitions. With cavities, also computes for each
+    /// neighbour that of the other neighbours, given that the neighbour is susceptible.
     #[inline(always)]
-    fn multiply(&mut self, change: &Change, place: usize, has_cavities: bool) -> Lanes {
+    fn by_neighbours(&mut self, change: &Change, place: usize, has_cavities: bool) -> Lanes {
         let n_cavities = self.beliefs.n_cavities;
-        let mut product = [1.0; LANES];
+        let mut any = [0.0; LANES];
         for Neighbour { index, sources } in &change.neighbours {
             // The cavity of the neighbour that excludes this cell, which lies in the opposite direction.
             let opposite = self.offsets.len() - 1 - index;
             let of = if has_cavities { opposite } else { n_cavities };
             let at = place.wrapping_add_signed(self.offsets[*index]);
-            let mut factor = [1.0; LANES];
+            let mut by_one = [0.0; LANES];
             for (state, probability) in sources {
-                probability.subtract(&mut factor, self.belief(of, *state, at), place);
+                probability.add_product(&mut by_one, self.belief(of, *state, at), place);
             }
             // The sum of a belief can exceed 1 by rounding.
-            for lane in &mut factor {
-                *lane = if *lane < 0.0 { 0.0 } else { *lane };
+            for lane in &mut by_one {
+                *lane = if *lane > 1.0 { 1.0 } else { *lane };
             }
             if has_cavities {
-                self.work.rest[*index] = product;
-                self.work.factors[*index] = factor;
+                self.work.rest[*index] = any;
+                self.work.by_neighbour[*index] = by_one;
             }
-            multiply(&mut product, &factor);
+            or(&mut any, &by_one);
         }
         if has_cavities {
-            let mut later = [1.0; LANES];
+            let mut later = [0.0; LANES];
             let mut to_come = change.neighbours.iter().rev().peekable();
             for index in (0..n_cavities).rev() {
                 let Some(Neighbour { sources, .. }) = to_come.next_if(|it| it.index == index)
                 else {
-                    self.work.rest[index] = product;
+                    self.work.rest[index] = any;
                     continue;
                 };
                 let rest = &mut self.work.rest[index];
-                multiply(rest, &later);
+                or(rest, &later);
                 let own = sources
                     .iter()
                     .find(|source| Some(source.0) == self.susceptible);
                 if let Some((_, probability)) = own {
-                    let mut factor = [1.0; LANES];
-                    probability.subtract(&mut factor, &[1.0; LANES], place);
-                    multiply(rest, &factor);
+                    probability.or(rest, place);
                 }
-                multiply(&mut later, &self.work.factors[index]);
+                or(&mut later, &self.work.by_neighbour[index]);
             }
         }
-        product
+        any
     }
 
     /// Returns the belief about a chunk of cells in a state: a cavity, or for `n_cavities` the belief itself.
@@ -319,39 +318,38 @@ fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
     }
 }
 
-/// Computes `to += here (last - none)`.
+/// Computes `to += here (any - last)`.
 #[inline(always)]
-fn add_difference(to: &mut Lanes, here: &Lanes, last: &Lanes, none: &Lanes) {
+fn add_difference(to: &mut Lanes, here: &Lanes, any: &Lanes, last: &Lanes) {
     for lane in 0..LANES {
-        to[lane] += here[lane] * (last[lane] - none[lane]);
+        to[lane] += here[lane] * (any[lane] - last[lane]);
+    }
+}
+
+/// Adds the probability of an independent event: `any` becomes the probability of one of the two.
+#[inline(always)]
+fn or(any: &mut Lanes, event: &Lanes) {
+    for lane in 0..LANES {
+        any[lane] += event[lane] * (1.0 - any[lane]);
     }
 }
 
 impl Values {
-    /// Computes `to *= self`.
+    /// Like [`or`], with these values as the probabilities of the event.
     #[inline(always)]
-    fn multiply(&self, to: &mut Lanes, place: usize) {
+    fn or(&self, any: &mut Lanes, place: usize) {
         match self {
-            Self::One(number) => multiply(to, &[*number; LANES]),
-            Self::Plane(numbers) => multiply(to, lanes_from(numbers, place)),
+            Self::One(number) => or(any, &[*number; LANES]),
+            Self::Plane(numbers) => or(any, lanes_from(numbers, place)),
         }
     }
 
-    /// Computes `to -= self by`.
+    /// Computes `to += self by`.
     #[inline(always)]
-    fn subtract(&self, to: &mut Lanes, by: &Lanes, place: usize) {
+    fn add_product(&self, to: &mut Lanes, by: &Lanes, place: usize) {
         match self {
-            Self::One(number) => {
-                for lane in 0..LANES {
-                    to[lane] -= number * by[lane];
-                }
-            }
-            Self::Plane(numbers) => {
-                let numbers = lanes_from(numbers, place);
-                for lane in 0..LANES {
-                    to[lane] -= numbers[lane] * by[lane];
-                }
-            }
+            Self::One(number) => add_product(to, &[*number; LANES], by),
+            Self::Plane(numbers) => add_product(to, lanes_from(numbers, place), by),
         }
     }
 
@@ -380,7 +378,7 @@ impl Builder<'_> {
                 let hazards = so_far
                     .iter()
                     .map(|it| scaled(it.base, it.factors.of_base(cell)));
-                (-hazards.sum::<f64>()).exp()
+                -(-hazards.sum::<f64>()).exp_m1()
             });
             let is_new = !transitions[k].near.is_empty();
             Change {

@@ -30,11 +30,3 @@ pub fn add(to: &mut Lanes, from: &Lanes) {
         to[lane] += from[lane];
     }
 }
-
-/// Computes `to *= by`.
-#[inline(always)]
-pub fn multiply(to: &mut Lanes, by: &Lanes) {
-    for lane in 0..LANES {
-        to[lane] *= by[lane];
-    }
-}

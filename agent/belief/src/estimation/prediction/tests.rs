@@ -187,6 +187,47 @@ fn predictions_are_those_of_the_formula() {
     }
 }
 
+/// Returns the text of random transitions, with probabilities from 1e-7 to .7 and tables of up to 5 x 5 cells.
+fn random_transitions(seed: u64) -> String {
+    let mut at = 0..;
+    let mut random = || random(seed, at.next().expect("endless"));
+    let mut text = String::new();
+    for (from, to) in [(0, 1), (1, 2), (2, 0)] {
+        let [from, to] = [from, to].map(|state| ["green", "fire", "ash"][state]);
+        let mut p = |scale: f64| scale * (1e-7_f64 / 0.7).powf(random());
+        text += &format!(
+            "[[transitions]]\nfrom = \"{from}\"\nto = \"{to}\"\nbase = {:?}\n",
+            p(0.1)
+        );
+        for (index, source) in ["fire", "ash"].into_iter().enumerate() {
+            let side = 1 + 2 * ((seed as usize + index) % 3);
+            let mut rows = vec![vec![0.0; side]; side];
+            let cells = rows.iter_mut().flatten().enumerate();
+            cells.for_each(|(cell, it)| *it = if cell == side * side / 2 { 0.0 } else { p(0.7) });
+            text += &format!("near.{source} = {rows:?}\n");
+        }
+    }
+    text
+}
+
+#[test]
+fn a_cell_is_predicted_to_a_relative_1e_5_by_a_thousand_random_models() {
+    for seed in 0..1000 {
+        let model = model(&random_transitions(seed));
+        let states = Grid::from_shape_fn((5, 6), |(row, col)| {
+            (3.0 * random(seed, row * 6 + col)) as u8
+        });
+        let mut belief = Belief::from_states(&states, 3).expect("states");
+        let expected = formula(&model, &belief);
+        let mut prediction = Prediction::known(&model, &belief, false).expect("fits");
+        prediction.predict(&mut belief);
+        for (got, expected) in belief.as_slice().iter().zip(&expected) {
+            let off = (f64::from(*got) - expected).abs();
+            assert!(off <= 1e-5 * expected, "{seed}: {got} for {expected}");
+        }
+    }
+}
+
 #[test]
 fn an_edge_state_equals_a_border_of_cells_in_that_state() {
     for (text, cavities) in [(FIRE, false), (FIRE, true), (TANGLE, false), (TANGLE, true)] {
