@@ -24,23 +24,21 @@ pub struct Origin {
     pub shape: Shape,
 }
 
-/// The name of a kind of belief and the fields of Python's `Kind`.
-type Facts = (&'static str, &'static str, bool, bool, bool);
+/// The fields of Python's `Kind`.
+type Facts = (&'static str, bool, bool, bool);
 
-/// Returns the facts of each kind of belief that is corrected with frames.
+/// Returns the name and the facts of each kind of belief that is corrected with frames.
 #[pyfunction]
-pub fn belief_kinds() -> Vec<Facts> {
-    let facts = |kind: &BeliefKind| {
-        let needs_checkpoint = kind.learned_by.is_some();
+pub fn belief_kinds() -> Vec<(&'static str, Facts)> {
+    let facts = |it: &BeliefKind| {
         (
-            kind.name,
-            kind.about,
-            kind.knows_model,
-            needs_checkpoint,
-            kind.has_options,
+            it.about,
+            it.knows_model,
+            it.learned_by.is_some(),
+            it.has_options,
         )
     };
-    of_frames().map(facts).collect()
+    of_frames().map(|kind| (kind.name, facts(kind))).collect()
 }
 
 impl Origin {

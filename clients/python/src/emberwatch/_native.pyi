@@ -46,6 +46,8 @@ class _Spec(Protocol):
     @property
     def description(self) -> _Text | None: ...
 
+#: The default kind of belief where a model is known.
+RECOMMENDED: str
 VERSION: str
 
 #: Smallest training seed. Worlds with smaller seeds are for tests: do not train or tune on them.
@@ -505,7 +507,7 @@ class Estimators:
     def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]:
         """Returns log-likelihoods of frames `(n, H, W)` and numbers of observed cells, `(n,)`."""
 
-def belief_kinds() -> list[tuple[str, str, bool, bool, bool]]:
+def belief_kinds() -> list[tuple[str, tuple[str, bool, bool, bool]]]:
     """Returns the name of each kind of belief that frames can correct, and the fields of `Kind`."""
 
 def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:

@@ -27,9 +27,9 @@ from emberwatch.model import Model
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
     """Observes a belief about an environment's world instead of its frames.
 
-    By default the belief is the recommended one of the environment's model. The wrapper is for single
-    environments; wrap the environments of a vector one by one. `terminated` and `truncated` pass
-    through, and only `reset` resets the belief.
+    By default the belief is of the recommended kind, which knows the environment's model. The
+    wrapper is for single environments; wrap the environments of a vector one by one. `terminated`
+    and `truncated` pass through, and only `reset` resets the belief.
 
     Emberwatch's environments report the world's step k in ``info["step"]``, and the belief follows
     it. After a step that makes only one move of a path, the belief stays as it is. After a step

@@ -42,7 +42,7 @@ class Kind(NamedTuple):
 
 def kinds() -> dict[str, Kind]:
     """Returns the kinds of belief, such as ``"known"`` and ``"learned"``."""
-    return {name: Kind(*facts) for name, *facts in _native.belief_kinds()}
+    return {name: Kind(*facts) for name, facts in _native.belief_kinds()}
 
 
 def known(
