@@ -269,7 +269,7 @@ impl CompareCommand {
 
     /// Returns whether worlds have several robots, or `--team` names other kinds than `alone`.
     fn has_teams(&self) -> bool {
-        let of_task = self.worlds.task().map(|task| task.robots);
+        let of_task = self.worlds.task().map(|task| task.world.robots);
         let mut robots = self.robots.iter().copied().chain(of_task);
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }

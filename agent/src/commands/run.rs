@@ -117,7 +117,7 @@ impl RunCommand {
 }
 
 fn task_with_model(task: Task) -> Result<(Task, Option<Model>)> {
-    let model = (!task.is_recorded()).then(|| model_of(&task));
+    let model = (!task.world.is_recorded()).then(|| model_of(&task));
     Ok((task, model.transpose()?))
 }
 

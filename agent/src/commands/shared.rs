@@ -70,7 +70,7 @@ pub fn model_named(name: &str) -> Result<Model> {
 
 /// Returns the model of a task with simulated worlds, with the task's sensor.
 pub fn model_of(task: &Task) -> Result<Model> {
-    with_sensor(model_named(&task.model)?, task.radius())
+    with_sensor(model_named(&task.world.model)?, task.world.radius())
 }
 
 /// Returns a model whose robots see `radius` rows and columns beyond their path; `None` keeps the model's radius.

@@ -138,7 +138,7 @@ impl WorldFlags {
     /// Returns the number of scored steps. Fails if the shortest episode has fewer steps.
     pub fn steps(&self, info: &ServerInfo) -> Result<u64> {
         let longest = info.shortest_episode().unwrap_or(u64::MAX);
-        let of_task = self.task().map(|task| task.max_steps);
+        let of_task = self.task().map(|task| task.world.max_steps);
         let default = of_task.unwrap_or(BENCHMARK_STEPS.min(longest));
         let steps = self.steps.unwrap_or(default);
         ensure!(
@@ -188,8 +188,8 @@ impl GridFlags {
     /// predict, if one was given.
     pub fn check(&self) -> Result<Option<Model>> {
         let (model, height, width) = match &self.task {
-            Some(task) if task.is_recorded() => return Ok(None),
-            Some(task) => (model_of(task)?, task.height, task.width),
+            Some(task) if task.world.is_recorded() => return Ok(None),
+            Some(task) => (model_of(task)?, task.world.height, task.world.width),
             None if self.states.is_some() => return self.model_of_states(),
             None => {
                 let model = with_sensor(model_named(self.model())?, self.radius())?;
