@@ -168,7 +168,7 @@ impl Table {
 
 fn a_handshake_tells_everything_a_client_needs(client: Client) {
     let flags = "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3 --max-steps 9 \
-                 --coverage client --lease-millis 1234 --publish-truth --robots 2 --deadline-ms 99";
+                 --coverage client --lease-millis 1234 --publish-truth --robots 2 --deadline-millis 99";
     let server = Server::start(flags);
     let request = Request::Hello {
         protocol: VERSION,

@@ -288,7 +288,7 @@ fn a_stopped_agent_delays_its_world_until_its_lease_ends() {
 
 #[test]
 fn a_stopped_agent_is_late_and_flies_again_when_it_wakes() {
-    let mut lab = Lab::new("--lease-millis 86400000 --deadline-ms 200");
+    let mut lab = Lab::new("--lease-millis 86400000 --deadline-millis 200");
     let [one, two, mut three] = lab.start_agents();
     three.stop();
     for _ in 0..3 {
@@ -304,7 +304,7 @@ fn a_stopped_agent_is_late_and_flies_again_when_it_wakes() {
 #[test]
 #[ignore = "takes minutes"]
 fn agents_disturbed_at_random_change_nothing_for_the_others() {
-    let mut lab = Lab::new("--lease-millis 86400000 --deadline-ms 100");
+    let mut lab = Lab::new("--lease-millis 86400000 --deadline-millis 100");
     let mut agents = lab.start_agents();
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     for _ in 0..50 {

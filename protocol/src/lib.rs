@@ -11,6 +11,8 @@
 //! once. A *frame* contains the observations of a step. A *lease* is the right to fly robots.
 
 #[cfg(feature = "program")]
+mod flags;
+#[cfg(feature = "program")]
 mod logging;
 #[cfg(feature = "program")]
 pub mod program;
@@ -23,7 +25,8 @@ pub use emberwatch_messages::{
 pub use emberwatch_model as model;
 pub use emberwatch_model::{
     Airspace, Cell, Coverage, Dynamics, Frame, Grid, Model, Move, Probabilities, Shape, Transition,
-    UNOBSERVED, built_in, dynamics, frame, grid, path, randomness, task, transition, vectors,
+    UNOBSERVED, built_in, dynamics, frame, grid, path, randomness, settings, task, transition,
+    vectors,
 };
 pub use wire::connection::{self, Connection};
 pub use wire::{

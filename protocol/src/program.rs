@@ -13,6 +13,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+pub use crate::flags::Flags;
 pub use crate::logging::{Log, start_logging};
 pub use crate::wire::process::{NotWatched, WatchedProcess, node_pid};
 pub use emberwatch_messages::process::pid_namespace;

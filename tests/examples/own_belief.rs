@@ -15,6 +15,7 @@ use emberwatch_learning::policy::{BEAM, Goal, Policy};
 use emberwatch_learning::rollout::{Rollout, building, step};
 use emberwatch_learning::served::Served;
 use emberwatch_protocol::client::{Claim, Client};
+use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_protocol::{Frame, Model};
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::embedded::Embedded;
@@ -86,11 +87,14 @@ fn main() -> Result<()> {
 fn mean_reward(policy: &Policy, model: &Model) -> Result<f64> {
     let settings = ServerConfig {
         worlds: WORLDS,
-        height: 32,
-        width: 32,
-        moves: 32,
-        burn_in: 5000,
         seed: 1000,
+        world: WorldSettings {
+            height: 32,
+            width: 32,
+            moves: 32,
+            burn_in: 5000,
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     };
     let mut client = Client::acquire(Embedded::new(settings.check()?)?, &Claim::new(0..WORLDS))?;

@@ -10,6 +10,7 @@ use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::path::path_from_bytes;
 use emberwatch_protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
+use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_protocol::{Client, Connection, Move};
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::snapshot::{SnapshotWorld, WorldSpec, encode};
@@ -206,10 +207,13 @@ pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
 /// Returns the settings and rules of the worlds of a [`SMALL`] server.
 pub fn small_spec(burn_in: u64) -> WorldSpec {
     let config = ServerConfig {
-        height: 5,
-        width: 7,
-        moves: 6,
-        burn_in,
+        world: WorldSettings {
+            height: 5,
+            width: 7,
+            moves: 6,
+            burn_in,
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     };
     let checked = config.check().expect("valid settings");

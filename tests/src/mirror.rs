@@ -8,6 +8,7 @@ use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::{FrameHeader, RobotResult, Status, WorldResult};
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::path::{path_from_bytes, path_to_bytes};
+use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_protocol::{Client, Coverage, Move};
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::results::{robot_result, world_result};
@@ -29,11 +30,14 @@ impl Mirror {
     /// their default values.
     pub fn of(info: &ServerInfo) -> Self {
         let config = ServerConfig {
-            height: info.height,
-            width: info.width,
-            moves: info.n_moves,
-            robots: info.n_robots,
-            burn_in: info.burn_in,
+            world: WorldSettings {
+                height: info.height,
+                width: info.width,
+                moves: info.n_moves,
+                robots: info.n_robots,
+                burn_in: info.burn_in,
+                ..WorldSettings::default()
+            },
             ..ServerConfig::default()
         };
         let seed = config.seed;

@@ -69,21 +69,25 @@ impl Mission {
         };
         same("task", &task.name, &info.task.as_deref().unwrap_or("none"))?;
         let of_task = |what: &str| format!("the {what} of task {}:", task.name);
-        same(&of_task("moves"), &task.moves, &info.n_moves)?;
-        same(&of_task("robots"), &task.robots, &info.n_robots)?;
-        same(&of_task("max_steps"), &task.max_steps, &info.max_steps)?;
+        same(&of_task("moves"), &task.world.moves, &info.n_moves)?;
+        same(&of_task("robots"), &task.world.robots, &info.n_robots)?;
+        same(
+            &of_task("max_steps"),
+            &task.world.max_steps,
+            &info.max_steps,
+        )?;
         let radius = |model: &Model| model.file().sensor.as_ref().map_or(0, |it| it.radius);
         let of_model = || model.as_ref().map(radius);
-        if let Some(radius) = task.radius().or_else(of_model) {
+        if let Some(radius) = task.world.radius().or_else(of_model) {
             let got = info.airspace().map_err(anyhow::Error::msg)?.radius();
             same(&of_task("sensor_radius"), &radius, &got)?;
         }
         let Some(model) = model else {
             return Ok(()); // A recorded task does not set grid, burn-in or model.
         };
-        same(&of_task("height"), &task.height, &info.height)?;
-        same(&of_task("width"), &task.width, &info.width)?;
-        same(&of_task("burn_in"), &task.burn_in, &info.burn_in)?;
+        same(&of_task("height"), &task.world.height, &info.height)?;
+        same(&of_task("width"), &task.world.width, &info.width)?;
+        same(&of_task("burn_in"), &task.world.burn_in, &info.burn_in)?;
         let got = info.model.as_deref().map(Model::from_toml).transpose()?;
         ensure!(
             got.as_ref().is_none_or(|got| got == model),

@@ -23,7 +23,6 @@ use emberwatch_learning::learners;
 use emberwatch_learning::policy::{self, Goal, LearnedDecisions, Policy};
 use emberwatch_network::DeviceKind;
 use emberwatch_protocol::Model;
-use emberwatch_protocol::channels::MAX_ROBOTS;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::task::Task;
 use std::path::{Path, PathBuf};
@@ -50,9 +49,6 @@ pub struct CompareCommand {
     /// `exploit`; with teams: the first policy; on recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
-    /// Robots per world, separated by commas; each number is run separately [default: 1]
-    #[arg(long, conflicts_with_all = ["task", "instance"], value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=MAX_ROBOTS as i64))]
-    robots: Vec<u32>,
     /// How the robots of a world act together: kinds of team, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "alone")]
     team: Vec<Team>,
@@ -98,7 +94,7 @@ impl CompareCommand {
         self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = learners::read(checkpoints, &self.device.open()?)?;
-        let numbers: Vec<Option<u32>> = match self.robots.as_slice() {
+        let numbers: Vec<Option<u32>> = match self.robots() {
             [] => vec![None],
             robots => robots.iter().copied().map(Some).collect(),
         };
@@ -184,7 +180,8 @@ impl CompareCommand {
         info: &ServerInfo,
     ) -> Result<()> {
         let robots = info.n_robots;
-        let is_here = |run: &&PolicyRun| run.robots == robots || !self.robots.contains(&run.robots);
+        let is_here =
+            |run: &&PolicyRun| run.robots == robots || !self.robots().contains(&run.robots);
         let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
         let recent_steps = Some(comparison.recent_steps);
         for group in groups(&added) {
@@ -271,10 +268,15 @@ impl CompareCommand {
         Ok(policies)
     }
 
+    /// Returns the given numbers of robots per world.
+    fn robots(&self) -> &[u32] {
+        &self.worlds.simulation.robots
+    }
+
     /// Returns whether worlds have several robots, or `--team` names other kinds than `alone`.
     fn has_teams(&self, task: Option<&Task>) -> bool {
-        let of_task = task.map(|task| task.robots);
-        let mut robots = self.robots.iter().copied().chain(of_task);
+        let of_task = task.map(|task| task.world.robots);
+        let mut robots = self.robots().iter().copied().chain(of_task);
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 

@@ -110,9 +110,9 @@ impl SuiteCommand {
         let arena = open(settings.clone(), &seeds, 1)?;
         let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
         ensure!(
-            task.max_steps <= longest,
+            task.world.max_steps <= longest,
             "max_steps: expected at most {longest}, the length of the shortest episode, got {}",
-            task.max_steps
+            task.world.max_steps
         );
         let mut policies: Vec<Policy> = Vec::new();
         let names = self.policies.iter().map(|name| &**name);
@@ -122,12 +122,12 @@ impl SuiteCommand {
                 policies.push(policy);
             }
         }
-        let several = task.robots > 1;
+        let several = task.world.robots > 1;
         let comparison = Comparison {
             policies,
             teams: vec![if several { Team::Joint } else { Team::Alone }],
             seeds,
-            steps: task.max_steps,
+            steps: task.world.max_steps,
             recent_steps: RECENT_STEPS,
             config: config.clone(),
             learned: Learned::default(),
@@ -212,7 +212,7 @@ impl SuiteCommand {
     /// Reads a policy's checkpoints. With `--train`, first runs the missing trainings.
     fn prepare(&self, plan: &Plan, policy: &Policy) -> Result<Trained> {
         ensure!(
-            !(plan.task().is_recorded() && policy.belief.knows_model),
+            !(plan.task().world.is_recorded() && policy.belief.knows_model),
             "it needs a known model, and recorded worlds have none"
         );
         let is_own =

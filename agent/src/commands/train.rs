@@ -44,7 +44,7 @@ const COVERAGES: [(bool, &str, &str); 2] = [
 #[derive(Args)]
 pub struct TrainCommand {
     /// Train on this running server, instead of simulating worlds
-    #[arg(long, conflicts_with = "SimulationFlags")]
+    #[arg(long, conflicts_with = "settings")]
     instance: Option<String>,
     /// Number of the server's first world to act on
     #[arg(long, default_value_t = 0, requires = "instance")]
@@ -286,15 +286,15 @@ impl TrainCommand {
             }
             return Ok(worlds);
         }
-        let default = ServerConfig {
+        let mut default = ServerConfig {
             seed: self.seed,
-            burn_in: match self.settings.preset {
-                Preset::Default => BURN_IN,
-                Preset::Paper => 0,
-            },
-            max_steps: episode_steps.unwrap_or(0),
             ..ServerConfig::default()
         };
+        default.world.burn_in = match self.settings.preset {
+            Preset::Default => BURN_IN,
+            Preset::Paper => 0,
+        };
+        default.world.max_steps = episode_steps.unwrap_or(0);
         simulate(self.simulation.check(&default)?, training)
     }
 }

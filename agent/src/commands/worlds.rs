@@ -4,16 +4,16 @@ use super::shared::parse_range;
 use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::client::worlds::Worlds;
 use anyhow::{Result, ensure};
-use clap::{Args, value_parser};
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, Id, value_parser};
 use emberwatch_protocol::Model;
-use emberwatch_protocol::built_in::{listed, state_names};
+use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::control::ServerInfo;
-use emberwatch_protocol::model::MAX_RADIUS;
-use emberwatch_protocol::task::{MAX_SEEDS, Start, Task};
+use emberwatch_protocol::model::settings::{Start, WorldSettings};
+use emberwatch_protocol::program::Flags;
+use emberwatch_protocol::task::{MAX_SEEDS, Task};
 use emberwatch_sim::config::{Checked, ConfigError, ServerConfig, model_named};
-use serde::Serialize;
-use serde_json::Value;
+use serde_json::{Map, Value};
 use std::ops::Range;
 
 /// Default burn-in of comparisons and trainings.
@@ -27,7 +27,7 @@ const BENCHMARK_SEEDS: Range<u64> = 0..8;
 #[derive(Debug, Args)]
 pub struct WorldFlags {
     /// Use the worlds of this running server, instead of simulating worlds
-    #[arg(long, conflicts_with = "SimulationFlags")]
+    #[arg(long, conflicts_with = "settings")]
     instance: Option<String>,
     /// World seeds, FIRST..END [default: 0..8, or the task's test seeds]
     #[arg(long, value_parser = parse_seeds)]
@@ -36,44 +36,16 @@ pub struct WorldFlags {
     #[arg(long, value_parser = value_parser!(u64).range(1..=10_000_000))]
     steps: Option<u64>,
     #[command(flatten)]
-    simulation: SimulationFlags,
+    pub simulation: SimulationFlags,
 }
 
 /// Settings of simulated worlds.
-#[derive(Debug, Clone, Default, Args, Serialize)]
+#[derive(Debug, Clone)]
 pub struct SimulationFlags {
-    #[arg(long, value_name = "NAME|FILE", help = format!("Task: {}, or a task file", listed(Task::built_in_names())))]
     task: Option<String>,
-    #[arg(long, value_name = "NAME|FILE",
-        help = format!("Model: {}, or a model file; with --states: the model of beliefs [default: wildfire; with \
-            --states: none]", listed(Model::built_in_names())))]
-    model: Option<String>,
-    #[arg(long, value_parser = value_parser!(u8).range(..=MAX_RADIUS as i64),
-        help = format!("Rows and columns that robots see beyond each cell of their path, 0 to {MAX_RADIUS} [default: \
-            the model's]"))]
-    sensor_radius: Option<u8>,
-    /// Grid height in cells [default: 64]
-    #[arg(long)]
-    height: Option<usize>,
-    /// Grid width in cells [default: 64]
-    #[arg(long)]
-    width: Option<usize>,
-    /// Number of moves in a path [default: 64]
-    #[arg(long)]
-    moves: Option<usize>,
-    /// Steps simulated before the first one [default: 25000; `train --preset paper`: 0]
-    #[arg(long)]
-    burn_in: Option<u64>,
-    #[arg(long, value_name = "NAME|FILE|FOLDER",
-        help = format!("Recorded states, instead of simulated states: {}, or a .npz or .npy file or folder",
-            listed(state_names())))]
-    states: Option<String>,
-    /// Let the world's seed also choose a symmetry of the grid: a rotation or reflection of the recorded states
-    #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
-    states_symmetries: Option<bool>,
-    /// Start each episode at a recorded step from 0 to STEPS, drawn by the world's seed [default: 0]
-    #[arg(long, value_name = "STEPS")]
-    states_offset: Option<u64>,
+    worlds: Map<String, Value>,
+    /// Numbers of robots per world.
+    pub robots: Vec<u32>,
 }
 
 /// Worlds that are not open yet.
@@ -83,39 +55,86 @@ pub enum Source {
     Settings(Box<Checked>, Option<Box<Model>>),
 }
 
+impl Args for SimulationFlags {
+    fn group_id() -> Option<Id> {
+        Flags::<WorldSettings>::group_id()
+    }
+
+    fn augment_args(command: Command) -> Command {
+        let task = Arg::new("task").long("task").value_name("NAME|FILE");
+        let names = listed(Task::built_in_names());
+        let task = task.help(format!(
+            "Task, which decides all of these settings: {names}, or a path"
+        ));
+        let burn_in =
+            "Number of steps simulated before k = 0 [default: 25000; `train --preset paper`: 0]";
+        Flags::<WorldSettings>::augment_args(command)
+            .mut_group("settings", |group| group.arg("task"))
+            .mut_arg("burn_in", |flag| flag.help(burn_in))
+            .mut_arg("robots", |flag| flag.value_delimiter(','))
+            .arg(task)
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for SimulationFlags {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let robots = matches.get_many::<Value>("robots").into_iter().flatten();
+        let number = |robots: &Value| robots.as_u64().unwrap_or_default() as u32;
+        Ok(Self {
+            task: matches.get_one::<String>("task").cloned(),
+            worlds: Flags::<WorldSettings>::from_arg_matches(matches)?
+                .given()
+                .clone(),
+            robots: robots.map(number).collect(),
+        })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
 impl SimulationFlags {
     /// Returns checked settings of worlds to simulate. `default`: the settings without flags.
     ///
     /// # Errors
-    /// If a setting is invalid, or a task or recorded states already determine it.
+    /// If a setting is invalid, or a task or recorded states already decide it.
     pub fn check(&self, default: &ServerConfig) -> Result<Checked, ConfigError> {
-        let mut given = match serde_json::to_value(self) {
-            Ok(Value::Object(given)) => given,
-            _ => unreachable!("invariant: flags serialise"),
-        };
-        given.retain(|_, value| !value.is_null());
+        let task = self
+            .task
+            .iter()
+            .map(|task| ("task".into(), task.as_str().into()));
+        let given = self.worlds.clone().into_iter().chain(task).collect();
         default.with(&given)?.check()
     }
 
     /// Separates the model of beliefs about recorded states from the settings of the worlds.
     fn separate(&self) -> Result<(Self, Option<Model>)> {
-        let (mut worlds, mut known) = (self.clone(), None);
-        if self.states.is_some()
-            && let Some(name) = worlds.model.take()
-        {
-            let model = model_named(&name)?;
-            known = Some(match self.sensor_radius {
-                Some(radius) => model.with_radius(radius.into())?,
-                None => model,
-            });
+        let mut flags = self.clone();
+        if !flags.worlds.contains_key("states") {
+            return Ok((flags, None));
         }
-        Ok((worlds, known))
+        let name = flags.worlds.remove("model");
+        let model = name.as_ref().and_then(Value::as_str).map(model_named);
+        let Some(model) = model.transpose()? else {
+            return Ok((flags, None));
+        };
+        let radius = flags.worlds.get("sensor_radius").and_then(Value::as_u64);
+        let model = radius.map_or(Ok(model.clone()), |radius| {
+            model.with_radius(radius as usize)
+        });
+        Ok((flags, Some(model?)))
     }
 }
 
 impl WorldFlags {
-    /// Checks the settings of the worlds, without opening them. `n_robots`: robots per world; `None` for one robot, or
-    /// any number on a running server.
+    /// Checks the settings of the worlds, without opening them. `n_robots`: the number of robots per world, if it was
+    /// given.
     ///
     /// # Errors
     /// If the settings are invalid.
@@ -123,19 +142,16 @@ impl WorldFlags {
         if let Some(name) = &self.instance {
             return Ok(Source::Server(Instance::new(name)?));
         }
-        let robots = n_robots.unwrap_or(1);
-        let default = ServerConfig {
-            robots,
+        let (mut flags, known) = self.simulation.separate()?;
+        if let Some(robots) = n_robots {
+            flags.worlds.insert("robots".into(), robots.into());
+        }
+        let mut default = ServerConfig::default();
+        default.world.burn_in = BURN_IN;
+        if n_robots.is_some_and(|robots| robots > 1) {
             // With the same start and the same belief, all robots would fly the same path forever.
-            start: if robots > 1 {
-                Start::Random
-            } else {
-                Start::Corner
-            },
-            burn_in: BURN_IN,
-            ..ServerConfig::default()
-        };
-        let (flags, known) = self.simulation.separate()?;
+            default.world.start = Start::Random;
+        }
         let mut checked = flags.check(&default)?;
         let seeds = self.seeds_of(checked.task.as_ref());
         checked.config.seed = seeds.start;
@@ -158,7 +174,7 @@ impl WorldFlags {
     /// Returns the number of scored steps. Fails if the shortest episode has fewer steps.
     pub fn steps(&self, task: Option<&Task>, info: &ServerInfo) -> Result<u64> {
         let longest = info.shortest_episode().unwrap_or(u64::MAX);
-        let of_task = task.map(|task| task.max_steps);
+        let of_task = task.map(|task| task.world.max_steps);
         let default = of_task.unwrap_or(BENCHMARK_STEPS.min(longest));
         let steps = self.steps.unwrap_or(default);
         ensure!(

@@ -58,7 +58,7 @@ def check_marks(look) -> None:
 
 
 def test_a_team_of_an_agent_that_flies_one_that_hangs_and_nobody(programs, open_page):
-    server = programs.server(robots=3, deadline_ms=50, lease_millis=600_000, publish_truth=True)
+    server = programs.server(robots=3, deadline_millis=50, lease_millis=600_000, publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
     hanging = programs.agent(server.instance, robot=1)
     look.eventually(lambda: states(look) == ["hovered", "flew", "hovered"], "it flies alone")

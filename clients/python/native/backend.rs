@@ -8,11 +8,13 @@ use emberwatch_messages::backend::Backend;
 use emberwatch_messages::limits::threads::spawn;
 use emberwatch_model::Model;
 use emberwatch_model::hazards::Hazards;
+use emberwatch_model::settings::{SettingError, Settings as _, WorldSettings};
 use emberwatch_sim::config::{Checked, ServerConfig, model_named};
 use emberwatch_sim::embedded::{Embedded, wait_for};
 use emberwatch_sim::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
@@ -95,7 +97,8 @@ impl CheckedSettings {
         let listing = task.listing.as_ref();
         let (ids, version) = listing.map_or(("", 0), |it| (&it.ids, it.version));
         let Range { start, end } = task.test_seeds;
-        let (moves, robots, steps) = (task.moves, task.robots, task.max_steps);
+        let world = &task.world;
+        let (moves, robots, steps) = (world.moves, world.robots, world.max_steps);
         Some((&task.name, moves, robots, steps, start, end, ids, version))
     }
 
@@ -153,6 +156,15 @@ impl CheckedSettings {
         let given = settings.into();
         Ok(Self { given, checked })
     }
+}
+
+/// Returns the defaults of the settings of worlds as JSON, by name.
+#[pyfunction]
+pub fn world_settings() -> BTreeMap<&'static str, String> {
+    let settings = WorldSettings::settings().into_iter();
+    settings
+        .map(|it| (it.name, (it.default)().to_string()))
+        .collect()
 }
 
 /// Reads settings again for a copy in another process. Refuses files that have changed since `fingerprint` was made.
@@ -224,23 +236,17 @@ fn may_block(path: &String) -> bool {
 
 /// Refuses settings that apply only to a server.
 fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
-    let of_servers = |settings: &ServerConfig| {
-        [
-            ("instance", settings.instance.clone()),
-            ("deadline_millis", settings.deadline_millis.to_string()),
-            ("restore", settings.restore.clone()),
-            ("snapshot_every", settings.snapshot_every.to_string()),
-            ("snapshot_dir", settings.snapshot_dir.clone()),
-            ("snapshot_keep", settings.snapshot_keep.to_string()),
-        ]
-    };
-    let (given, defaults) = (of_servers(settings), of_servers(&ServerConfig::default()));
-    let wrong = given
-        .into_iter()
-        .zip(defaults)
-        .find(|(one, other)| one != other);
-    wrong.map_or(Ok(()), |((setting, got), _)| {
-        let expected = "expected to be left out, as worlds in this process have no server";
-        Err(refused(py, format!("{setting}: {expected}, got {got}")))
-    })
+    let values = settings.values();
+    let settings = ServerConfig::settings().into_iter();
+    for setting in settings.filter(|it| it.for_servers) {
+        let got = &values[setting.name];
+        if *got != (setting.default)() {
+            let expected = "to be left out, as worlds in this process have no server";
+            return Err(refused(
+                py,
+                SettingError::new(setting.name, expected, got.clone()),
+            ));
+        }
+    }
+    Ok(())
 }

@@ -65,6 +65,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<backend::CheckedSettings>()?;
     module.add_function(wrap_pyfunction!(backend::model_text, module)?)?;
     module.add_function(wrap_pyfunction!(backend::read_again, module)?)?;
+    module.add_function(wrap_pyfunction!(backend::world_settings, module)?)?;
     module.add_function(wrap_pyfunction!(prior::simulated_prior, module)?)?;
     module.add("RECOMMENDED", RECOMMENDED.name)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;

@@ -262,7 +262,7 @@ def test_four_single_robot_environments_equal_the_team(order: tuple[int, ...], r
 
 
 def test_a_late_path_is_dropped_and_reported() -> None:
-    with serving(robots=2, deadline_ms=50) as instance:
+    with serving(robots=2, deadline_millis=50) as instance:
         quick, slow = alone(instance, 0), alone(instance, 1, observation=PARTS)
         quick.reset()
         first, _ = slow.reset()

@@ -9,6 +9,7 @@ use emberwatch_messages::control::{Reply, Request};
 use emberwatch_messages::message::{Operation, Status, StepReply, StepRequest, VERSION};
 use emberwatch_messages::payload::write_step_body;
 use emberwatch_model::randomness::split_mix;
+use emberwatch_model::settings::WorldSettings;
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::simulator::{ClientId, Outcome, ServerStats, Simulator, Stepped};
 use emberwatch_sim::snapshot::decode;
@@ -34,18 +35,24 @@ impl Session {
     fn new(n_worlds: u32, team: u32) -> Self {
         Self::of(ServerConfig {
             worlds: n_worlds,
-            robots: team,
+            world: WorldSettings {
+                robots: team,
+                ..WorldSettings::default()
+            },
             ..ServerConfig::default()
         })
     }
 
     fn of(config: ServerConfig) -> Self {
-        let (n_worlds, n_robots) = (config.worlds, config.worlds * config.robots);
+        let (n_worlds, n_robots) = (config.worlds, config.worlds * config.world.robots);
         let config = ServerConfig {
-            burn_in: 2_000,
+            world: WorldSettings {
+                burn_in: 2_000,
+                ..config.world
+            },
             ..config
         };
-        let n_moves = config.moves as u32;
+        let n_moves = config.world.moves as u32;
         let checked = config.check().expect("bench settings");
         let threads = ThreadPoolBuilder::new().num_threads(1).build();
         let threads = threads.expect("bench threads");
@@ -128,7 +135,10 @@ fn simulator_step(criterion: &mut Criterion) {
         (
             model.to_owned(),
             ServerConfig {
-                model: model.into(),
+                world: WorldSettings {
+                    model: model.into(),
+                    ..WorldSettings::default()
+                },
                 ..default()
             },
         )
@@ -137,7 +147,10 @@ fn simulator_step(criterion: &mut Criterion) {
         (
             format!("radius {sensor_radius}"),
             ServerConfig {
-                sensor_radius,
+                world: WorldSettings {
+                    sensor_radius,
+                    ..WorldSettings::default()
+                },
                 ..default()
             },
         )

@@ -1,59 +1,67 @@
 //! The server's settings and their checks.
 
-use crate::bounds::BOUNDS;
 use crate::states_file::{StatesError, StatesFile};
 use crate::world::{Reach, Recorded};
-use emberwatch_messages::capacity::{MAX_ROBOT_NUMBERS, MAX_TEAM_CELLS};
+use emberwatch_messages::capacity::{MAX_ROBOT_NUMBERS, MAX_TEAM_CELLS, MAX_WORLDS};
 use emberwatch_messages::control::CoverageRule;
 use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::instance::Instance;
 use emberwatch_model::ModelError;
 use emberwatch_model::built_in::listed;
 use emberwatch_model::grid::ShapeError;
-use emberwatch_model::task::{Start, Task, TaskError};
+use emberwatch_model::settings;
+use emberwatch_model::settings::{ANY, SettingError, Settings, Start, WorldSettings};
+use emberwatch_model::task::{Task, TaskError};
 use emberwatch_model::text::{parse_problem, read_text, shortened};
 use emberwatch_model::{Model, Shape};
-use serde::{Deserialize, Serialize};
-use serde_json::{Map, Number, Value};
+use serde_json::{Map, Value};
 use std::fmt::Display;
 use std::path::Path;
 use std::sync::Arc;
 use thiserror::Error;
 
-/// Name of the default model.
-const WILDFIRE: &str = "wildfire";
+/// One day in milliseconds.
+const DAY: i128 = 86_400_000;
 
-/// All settings of a server. `config/server.toml` and the server's `flags.rs` explain each.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ServerConfig {
-    pub instance: String,
-    pub worlds: u32,
-    pub robots: u32,
-    pub deadline_millis: u64,
-    pub task: String,
-    pub model: String,
-    pub sensor_radius: i64,
-    pub states: String,
-    pub states_symmetries: bool,
-    pub states_offset: u64,
-    pub height: usize,
-    pub width: usize,
-    pub moves: usize,
-    pub seed: u64,
-    pub burn_in: u64,
-    pub max_steps: u64,
-    pub coverage: CoverageRule,
-    pub start: Start,
-    pub publish_truth: bool,
-    pub reveal_model: bool,
-    pub lease_millis: u64,
-    pub threads: usize,
-    pub history: u32,
-    pub restore: String,
-    pub snapshot_every: u64,
-    pub snapshot_dir: String,
-    pub snapshot_keep: u32,
+settings! {
+    /// All settings of a server; `config/server.toml` explains each further.
+    pub struct ServerConfig {
+        ..world: WorldSettings;
+        /// Name under which clients find this server
+        instance: String = "default".into() => { for_servers: true };
+        /// Use the worlds of a task, which decides all settings of worlds
+        task: String = String::new() => {
+            placeholder: "NAME|FILE",
+            names: Some(|| listed(Task::built_in_names())),
+        };
+        /// Number of independent worlds
+        worlds: u32 = 1 => { range: Some((1, MAX_WORLDS as i128)) };
+        /// Seed of world 0; world i starts from this seed plus i
+        seed: u64 = 0 => { range: Some(ANY) };
+        /// Maximum wait of a world for its robots' paths, in milliseconds after the first path; 0: no limit
+        deadline_millis: u64 = 0 => { range: Some((0, DAY)), for_servers: true };
+        /// Cells that a robot observes in a step: path (the cells on it), full (every cell), or client (path, unless a
+        /// request asks for every cell)
+        coverage: CoverageRule = CoverageRule::Path => { expected: "path, full or client" };
+        /// Publish the hidden states, for evaluation and display
+        publish_truth: bool = false => {};
+        /// Send clients the model
+        reveal_model: bool = true => {};
+        /// Time from the last use of a lease until it ends, in milliseconds
+        lease_millis: u64 = 30_000 => { range: Some((100, DAY)) };
+        /// Number of threads that simulate; 0: one per core
+        threads: usize = 0 => { range: Some((0, 256)) };
+        /// Number of the latest steps of each world whose frames are kept for agents that take over
+        history: u32 = 256 => { range: Some((1, 1_000_000)) };
+        /// Start with the worlds of this snapshot file, or of the latest one in this folder, if there is one
+        restore: String = String::new() => { placeholder: "FILE|FOLDER", for_servers: true };
+        /// Number of steps, on average over the worlds, between two snapshots; another is written at the end; 0: never
+        snapshot_every: u64 = 0 => { range: Some(ANY), placeholder: "STEPS", for_servers: true };
+        /// Folder for these snapshots
+        snapshot_dir: String = String::new() => { placeholder: "FOLDER", for_servers: true };
+        /// Number of these snapshots to keep, in addition to the latest one that is safely on disk
+        snapshot_keep: u32 = 3 => { range: Some((1, 1_000_000)), for_servers: true };
+    }
 }
 
 /// Checked settings, together with the model and the recorded states that were loaded for them.
@@ -92,21 +100,9 @@ pub enum ConfigError {
         path: String,
         problem: String,
     },
-    /// A setting outside its range.
-    #[error("{setting}: expected {expected}, got {got}")]
-    Range {
-        setting: &'static str,
-        expected: String,
-        got: String,
-    },
-    /// An error in a setting given by name ([`ServerConfig::with`]): the name is unknown, the value is invalid, or a
-    /// task or a states file already determines the setting.
-    #[error("{}: expected {expected}, got {}", shortened(setting), shortened(got))]
-    Given {
-        setting: String,
-        expected: String,
-        got: String,
-    },
+    /// A setting with an unknown name or a value outside its range, or one that a task or recorded states decide.
+    #[error(transparent)]
+    Setting(#[from] SettingError),
     #[error(transparent)]
     Task(#[from] TaskError),
     #[error(transparent)]
@@ -117,40 +113,6 @@ pub enum ConfigError {
     Model(#[from] ModelError),
     #[error(transparent)]
     States(#[from] StatesError),
-}
-
-impl Default for ServerConfig {
-    fn default() -> Self {
-        Self {
-            instance: "default".into(),
-            worlds: 1,
-            robots: 1,
-            deadline_millis: 0,
-            task: String::new(),
-            model: WILDFIRE.into(),
-            sensor_radius: -1,
-            states: String::new(),
-            states_symmetries: false,
-            states_offset: 0,
-            height: 64,
-            width: 64,
-            moves: 64,
-            seed: 0,
-            burn_in: 10_000,
-            max_steps: 0,
-            coverage: CoverageRule::Path,
-            start: Start::Corner,
-            publish_truth: false,
-            reveal_model: true,
-            lease_millis: 30_000,
-            threads: 0,
-            history: 256,
-            restore: String::new(),
-            snapshot_every: 0,
-            snapshot_dir: String::new(),
-            snapshot_keep: 3,
-        }
-    }
 }
 
 impl Checked {
@@ -167,44 +129,60 @@ impl Checked {
 }
 
 impl ServerConfig {
+    /// Returns a copy of these settings with the values in `given`, whose keys are the names in `config/server.toml`.
+    ///
+    /// # Errors
+    /// If a name is unknown, a value is invalid, or a task or recorded states decide the setting.
+    pub fn with(&self, given: &Map<String, Value>) -> Result<Self, ConfigError> {
+        let config = self.replaced(given)?;
+        if given.get("task").and_then(Value::as_str) == Some("") {
+            Task::named("")?;
+        }
+        let (has_task, has_states) = (!config.task.is_empty(), config.world.is_recorded());
+        let decider = if has_task { "task" } else { "states file" };
+        for setting in WorldSettings::settings() {
+            let is_decided = has_task || has_states && setting.of_states;
+            if let Some(got) = given.get(setting.name).filter(|_| is_decided) {
+                let expected = format!("to be left out, as the {decider} decides it");
+                return Err(SettingError::new(setting.name, expected, got.clone()).into());
+            }
+        }
+        Ok(config)
+    }
+
     /// Checks all settings and loads the files named in them.
     ///
-    /// A task replaces every setting that shapes the worlds. A states file replaces the model, the grid and the
-    /// burn-in.
+    /// A task replaces all settings of worlds. A states file replaces the model, the grid and the burn-in.
     pub fn check(mut self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
-        let task = self.take_task()?;
+        let name = Some(&self.task).filter(|name| !name.is_empty());
+        let task = name.map(|name| Task::named(name)).transpose()?;
+        if let Some(task) = &task {
+            self.world = task.world.clone();
+        }
         self.check_ranges()?;
-        let (model, recorded) = if self.states.is_empty() {
-            (None, None)
-        } else {
+        let (model, recorded) = if self.world.is_recorded() {
             self.read_states()
                 .map(|(model, it)| (Some(model), Some(it)))?
+        } else {
+            (None, None)
         };
-        let shape = Shape::new(self.height, self.width)?;
+        let shape = Shape::new(self.world.height, self.world.width)?;
         self.check_robots(shape)?;
-        if let Start::At(cell) = self.start
+        if let Start::At(cell) = self.world.start
             && !shape.contains(cell)
         {
             let expected = format!("a cell on the {shape} grid");
-            return Err(ConfigError::Range {
-                setting: "start",
-                expected,
-                got: cell.to_string(),
-            });
+            return Err(SettingError::new("start", expected, cell.to_string()).into());
         }
-        let model = model.map_or_else(|| model_named(&self.model), Ok)?;
-        let model = match usize::try_from(self.sensor_radius) {
-            Ok(radius) => model.with_radius(radius)?,
-            Err(_) => model,
+        let model = model.map_or_else(|| model_named(&self.world.model), Ok)?;
+        let model = match self.world.radius() {
+            Some(radius) => model.with_radius(radius)?,
+            None => model,
         };
         let airspace = model.airspace(shape)?;
-        let wrong = |[expected, got]: [String; 2]| ConfigError::Range {
-            setting: "start",
-            expected,
-            got,
-        };
-        let reach = Reach::of(self.start, &airspace, self.robots as usize).map_err(wrong)?;
+        let reach = Reach::of(self.world.start, &airspace, self.world.robots as usize);
+        let reach = reach.map_err(|[expected, got]| SettingError::new("start", expected, got))?;
         Ok(Checked {
             config: self,
             instance,
@@ -216,87 +194,66 @@ impl ServerConfig {
         })
     }
 
-    /// Copies the settings of the task, if there is one, and returns it.
-    fn take_task(&mut self) -> Result<Option<Task>, ConfigError> {
-        if self.task.is_empty() {
-            return Ok(None);
+    fn check_ranges(&self) -> Result<(), SettingError> {
+        let (values, is_recorded) = (self.values(), self.world.is_recorded());
+        let settings = Self::settings().into_iter();
+        for setting in settings.filter(|it| !(is_recorded && it.of_states)) {
+            let (value, default) = (&values[setting.name], (setting.default)());
+            setting.check(value)?;
+            if setting.for_states && !is_recorded && *value != default {
+                let expected = format!("{default} without a states file");
+                return Err(SettingError::new(setting.name, expected, value.clone()));
+            }
         }
-        let task = Task::named(&self.task)?;
-        (self.model, self.states) = (task.model.clone(), task.states.clone());
-        self.sensor_radius = task.sensor_radius;
-        (self.states_symmetries, self.states_offset) = (task.states_symmetries, task.states_offset);
-        (self.height, self.width) = (task.height, task.width);
-        (self.moves, self.robots) = (task.moves, task.robots);
-        (self.burn_in, self.max_steps, self.start) = (task.burn_in, task.max_steps, task.start);
-        Ok(Some(task))
-    }
-
-    fn check_ranges(&self) -> Result<(), ConfigError> {
-        let settings = self.values();
-        // Skips height and width, because recorded states may still replace them. `Shape` checks both later.
-        let bounds = BOUNDS
-            .iter()
-            .filter(|(it, ..)| !["height", "width"].contains(it));
-        for &(setting, least, most) in bounds {
-            let number = settings[setting].as_number().and_then(Number::as_i128);
-            let number = number.expect("invariant: bounded settings are integers");
-            in_range(setting, number, least, most)?;
-        }
-        let needs = |setting, expected: &str, got| {
-            let expected = expected.into();
-            Err(ConfigError::Range {
-                setting,
-                expected,
-                got,
-            })
-        };
         if (self.snapshot_every == 0) != self.snapshot_dir.is_empty() {
             let got = format!("{} and {:?}", self.snapshot_every, self.snapshot_dir);
-            return needs("snapshot_every and snapshot_dir", "both or neither", got);
-        }
-        if self.states.is_empty() && (self.states_symmetries || self.states_offset > 0) {
-            let got = format!("{} and {}", self.states_symmetries, self.states_offset);
-            let settings = "states_symmetries and states_offset";
-            return needs(settings, "false and 0 without a states file", got);
+            let settings = "snapshot_every and snapshot_dir";
+            return Err(SettingError::new(settings, "both or neither", got));
         }
         Ok(())
     }
 
-    fn check_robots(&self, shape: Shape) -> Result<(), ConfigError> {
-        let (n_robots, n_cells) = (i128::from(self.robots), shape.n_cells() as i128);
-        let n_all = i128::from(self.worlds) * n_robots;
-        in_range("worlds times robots", n_all, 1, MAX_ROBOT_NUMBERS as i128)?;
-        let most = MAX_TEAM_CELLS as i128;
-        in_range("cells times robots", n_cells * n_robots, 1, most)
-    }
-
-    /// Returns the settings by name.
-    pub fn values(&self) -> Map<String, Value> {
-        match serde_json::to_value(self) {
-            Ok(Value::Object(values)) => values,
-            _ => unreachable!("invariant: settings serialise"),
+    fn check_robots(&self, shape: Shape) -> Result<(), SettingError> {
+        let (n_robots, n_worlds) = (self.world.robots as usize, self.worlds as usize);
+        for (product, got, most) in [
+            (
+                "worlds times robots",
+                n_worlds * n_robots,
+                MAX_ROBOT_NUMBERS,
+            ),
+            (
+                "cells times robots",
+                shape.n_cells() * n_robots,
+                MAX_TEAM_CELLS,
+            ),
+        ] {
+            if !(1..=most).contains(&got) {
+                return Err(SettingError::new(product, format!("1 to {most}"), got));
+            }
         }
+        Ok(())
     }
 
     /// Reads the settings from a TOML file.
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
         let wrong = |error: &dyn Display| file_error("config file", path, error);
         let text = read_text(path).map_err(|error| wrong(&error))?;
-        toml::from_str(&text).map_err(|error| wrong(&parse_problem(error)))
+        let given = toml::from_str(&text).map_err(|error| wrong(&parse_problem(error)))?;
+        let config = Self::default().replaced(&given);
+        config.map_err(|error| wrong(&error))
     }
 
-    /// Reads the states file and replaces the settings that it determines: grid, burn-in and model.
+    /// Reads the states file and replaces the settings that it determines.
     fn read_states(&mut self) -> Result<(Model, CheckedStates), ConfigError> {
-        let file = StatesFile::named(&self.states)?;
-        (self.height, self.width) = file.shape.dim();
-        (self.burn_in, self.model) = (0, String::new());
+        let file = StatesFile::named(&self.world.states)?;
+        self.world = self.world.without_states();
+        (self.world.height, self.world.width) = file.shape.dim();
         let checksum = file.sequences.checksum();
-        let (symmetries, offset) = (self.states_symmetries, self.states_offset);
+        let (symmetries, offset) = (self.world.states_symmetries, self.world.states_offset);
         let recorded = Recorded::new(file.sequences.arrays, file.shape, symmetries, offset)
-            .map_err(|most| ConfigError::Range {
-                setting: "states_offset",
-                expected: format!("0 to {most}, as the shortest sequence allows"),
-                got: offset.to_string(),
+            .map_err(|most| {
+                let expected = format!("0 to {most}, as the shortest sequence allows");
+                SettingError::new("states_offset", expected, offset)
             })?;
         let description = toml::to_string(&file.description);
         let states = CheckedStates {
@@ -340,27 +297,70 @@ fn file_error(what: &'static str, path: &Path, problem: impl Display) -> ConfigE
     }
 }
 
-fn in_range(setting: &'static str, got: i128, least: i128, most: i128) -> Result<(), ConfigError> {
-    if (least..=most).contains(&got) {
-        return Ok(());
-    }
-    Err(ConfigError::Range {
-        setting,
-        expected: format!("{least} to {most}"),
-        got: got.to_string(),
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use emberwatch_model::Cell;
+    use serde_json::json;
 
     #[test]
     fn the_documented_file_contains_the_defaults() {
         let text = include_str!("../../../config/server.toml");
-        let read: ServerConfig = toml::from_str(text).expect("settings");
-        assert_eq!(read, ServerConfig::default());
-        let listed: toml::Table = text.parse().expect("TOML");
-        assert_eq!(listed.len(), read.values().len(), "a setting is not listed");
+        let listed: Map<String, Value> = toml::from_str(text).expect("settings");
+        assert_eq!(listed, ServerConfig::default().values());
+        let settings = ServerConfig::settings();
+        assert_eq!(listed.len(), settings.len());
+        for setting in settings {
+            assert_eq!(setting.check(&listed[setting.name]), Ok(()));
+        }
+    }
+
+    fn with(given: Value) -> Result<ServerConfig, String> {
+        let given = given.as_object().expect("a dictionary").clone();
+        let config = ServerConfig::default().with(&given);
+        config.map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn settings_are_replaced_by_name() {
+        let seed = u64::MAX;
+        let given = json!({"seed": seed, "height": 7, "start": "3, 5", "coverage": "full",
+            "model": "wildfire-small", "publish_truth": true, "sensor_radius": 8});
+        let config = with(given).expect("valid");
+        let world = config.world;
+        assert_eq!((config.seed, world.height, world.width), (seed, 7, 64));
+        assert_eq!(world.start, Start::At(Cell { row: 3, col: 5 }));
+        assert_eq!(config.coverage, CoverageRule::Full);
+        assert!(config.publish_truth && world.sensor_radius == 8);
+        let start = json!({"start": {"row": 3, "col": 5}});
+        assert_eq!(with(start).map(|it| it.world.start), Ok(world.start));
+    }
+
+    /// Invalid settings, and a part of the error for each.
+    const WRONG: &str = r#"
+{"height": -1} => height: expected 1 to 4096, got -1
+{"height": 16.0} => height: expected 1 to 4096, got 16.0
+{"height": "x"} => height: expected 1 to 4096, got x
+{"width": 4097} => width: expected 1 to 4096, got 4097
+{"moves": null} => moves: expected 1 to 4096, got null
+{"seed": -1} => seed: expected 0 to 18446744073709551615, got -1
+{"worlds": 4294967296} => worlds: expected 1 to 1024, got 4294967296
+{"reveal_model": 1} => reveal_model: expected true or false, got 1
+{"model": 3} => model: expected text, got 3
+{"coverage": "some"} => coverage: expected path, full or client, got some
+{"start": "north"} => start: expected corner, centre, random or ROW,COL, got north
+{"wrolds": 2} => wrolds: expected the name of a setting (burn_in, coverage
+{"task": "small", "robots": 1} => robots: expected to be left out, as the task decides it, got 1
+{"states": "jacksboro", "height": 1} => height: expected to be left out, as the states file
+{"task": ""} => task : expected a name or a file, got ""
+"#;
+
+    #[test]
+    fn errors_name_the_wrong_setting() {
+        for line in WRONG.trim().lines() {
+            let (given, words) = line.split_once(" => ").expect(line);
+            let error = with(serde_json::from_str(given).expect(line)).expect_err(line);
+            assert!(error.contains(words), "{line}: {error}");
+        }
     }
 }

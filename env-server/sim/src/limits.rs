@@ -50,7 +50,7 @@ pub fn check_memory(checked: &Checked, n_threads: usize) -> Result<(), NoMemory>
 /// Returns the length of the longest answer on the `step` channel, in bytes: the answer for all robots.
 pub fn answer_bytes(checked: &Checked) -> usize {
     let (config, n_cells) = (&checked.config, checked.shape.n_cells());
-    config.worlds as usize * (WORLD_BYTES + config.robots as usize * (ROBOT_BYTES + n_cells))
+    config.worlds as usize * (WORLD_BYTES + config.world.robots as usize * (ROBOT_BYTES + n_cells))
 }
 
 /// Returns an upper bound on the memory of a world, in bytes: its current states, its states at k = 0, its robots and
@@ -59,14 +59,14 @@ fn bytes_of_world(checked: &Checked) -> usize {
     let (config, n_cells) = (&checked.config, checked.shape.n_cells());
     let sensor = checked.model.file().sensor.as_ref();
     let radius = sensor.map_or(0, |sensor| sensor.radius);
-    let n_robots = config.robots as usize;
-    let n_seen = most_seen(radius, config.moves, n_cells);
+    let n_robots = config.world.robots as usize;
+    let n_seen = most_seen(radius, config.world.moves, n_cells);
     let work_space = match &checked.recorded {
         Some(_) => 0,
         None => Dynamics::n_bytes(&checked.model, checked.shape),
     };
     let of_states = 2 * (n_cells + work_space);
-    let robots = n_robots * bytes_of_robot(config.moves, n_seen, n_cells);
+    let robots = n_robots * bytes_of_robot(config.world.moves, n_seen, n_cells);
     let sees_all = config.coverage != CoverageRule::Path;
     let history = bytes_of_history(config.history as usize, n_robots, n_seen);
     let whole_frames = if sees_all {

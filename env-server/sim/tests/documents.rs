@@ -3,9 +3,9 @@
 use emberwatch_messages::capacity::{MAX_CLIENTS, MAX_ROBOT_NUMBERS, MAX_ROBOTS};
 use emberwatch_model::built_in::state_names;
 use emberwatch_model::grid::MAX_SIDE;
+use emberwatch_model::settings::{ANY, Settings};
 use emberwatch_model::task::Task;
 use emberwatch_model::{MAX_VALUES, Model};
-use emberwatch_sim::bounds::BOUNDS;
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::states_file::MAX_BYTES;
 use std::collections::BTreeSet;
@@ -35,9 +35,10 @@ fn every_task_has_its_row() {
         let shape = config.check().expect(name).shape;
         let listing = task.listing.expect("a built-in task");
         let ids = format!("`{}` v{}", listing.ids, listing.version);
-        let (world, seeds) = (task.model + &task.states, task.test_seeds);
+        let (settings, seeds) = (task.world, task.test_seeds);
+        let world = settings.model + &settings.states;
         let (first, last) = (seeds.start, seeds.end - 1);
-        let (moves, steps) = (task.moves, task.max_steps);
+        let (moves, steps) = (settings.moves, settings.max_steps);
         format!(
             "| `{name}` | {ids} | `{world}` | {shape} | {moves} | {steps} | {first} to {last} |"
         )
@@ -76,8 +77,9 @@ fn every_model_and_all_recorded_states_are_named() {
 #[test]
 fn every_setting_is_explained_with_its_range() {
     let file = include_str!("../../../config/server.toml");
-    let is_bounded = |most: i128| most < i128::from(u64::MAX);
-    for (setting, least, most) in BOUNDS.into_iter().filter(|it| is_bounded(it.2)) {
+    let settings = ServerConfig::settings().into_iter();
+    let ranges = settings.filter_map(|it| Some((it.name, it.range?)));
+    for (setting, (least, most)) in ranges.filter(|(_, range)| *range != ANY) {
         let (_, text) = file.split_once(&format!("\n{setting} = ")).expect(setting);
         let mut lines = text.lines();
         let first = lines.next().into_iter();

@@ -1,6 +1,7 @@
 //! Tests of states files: files in the form in which NumPy writes them, and the error for each kind of broken file.
 
 use emberwatch_model::built_in::state_names;
+use emberwatch_model::settings::WorldSettings;
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::states_file::{Sequences, StatesFile};
 use ndarray::{Array, Array3, Dimension};
@@ -287,24 +288,33 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
     ];
     let path = file_in(&folder, "lab.npz", &stored(&members));
     let config = |states_offset| ServerConfig {
-        states: path.display().to_string(),
-        states_offset,
+        world: WorldSettings {
+            states: path.display().to_string(),
+            states_offset,
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     };
     let checked = config(3).check().expect("valid");
-    let settings = &checked.config;
+    let settings = &checked.config.world;
     let decided = (settings.height, settings.width, settings.burn_in);
     assert_eq!((decided, &*settings.model), ((3, 4, 0), ""));
     let recorded = checked.recorded.expect("it is").recorded;
     assert_eq!((recorded.n_sequences(), recorded.n_steps()), (2, 1));
     let without = ServerConfig {
-        states_symmetries: true,
+        world: WorldSettings {
+            states_symmetries: true,
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     };
     let words = "states_offset: expected 0 to 3, as the shortest sequence allows, got 4";
     for (config, words) in [
         (config(4), words),
-        (without, "expected false and 0 without a states file"),
+        (
+            without,
+            "states_symmetries: expected false without a states file",
+        ),
     ] {
         let error = config.check().expect_err(words).to_string();
         assert!(error.contains(words), "{error}");

@@ -77,11 +77,11 @@ impl Ports {
     /// If another server runs the instance, or the system has too little memory or too few descriptors.
     pub fn open(checked: &Checked) -> Result<Self> {
         let (n_cells, config) = (checked.shape.n_cells(), &checked.config);
-        let of_robots = config.robots as usize * (ROBOT_BYTES + n_cells);
+        let of_robots = config.world.robots as usize * (ROBOT_BYTES + n_cells);
         let config = PortConfig {
             instance: checked.instance.clone(),
             n_cells,
-            frame_bytes: frame_bytes(config.robots, n_cells, config.moves),
+            frame_bytes: frame_bytes(config.world.robots, n_cells, config.world.moves),
             answer_bytes: config.worlds as usize * (WORLD_BYTES + of_robots),
             publish_truth: checked.config.publish_truth,
         };

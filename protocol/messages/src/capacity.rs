@@ -6,8 +6,7 @@ pub const MAX_CLIENTS: usize = 16;
 /// Maximum number of worlds of a server.
 pub const MAX_WORLDS: usize = 1024;
 
-/// Maximum number of robots of a world.
-pub const MAX_ROBOTS: usize = 64;
+pub use emberwatch_model::settings::MAX_ROBOTS;
 
 /// Maximum number of robots of a server, over all its worlds.
 pub const MAX_ROBOT_NUMBERS: usize = 4096;

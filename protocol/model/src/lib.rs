@@ -2,7 +2,7 @@
 //!
 //! This crate knows nothing of messages. All other modules index a [`grid`]. [`dynamics`] draws hidden states, and
 //! [`transition`] applies the same operator to beliefs. [`path`] and [`frame`] represent a robot's moves and
-//! observations. A [`task`] is a named set of worlds, and [`built_in`] contains the models, tasks and recorded states
+//! observations. [`settings`] define worlds, a [`task`] is a named set of worlds, and [`built_in`] contains the models, tasks and recorded states
 //! that ship with the programs. [`text`] reads settings and model files.
 
 mod airspace;
@@ -21,6 +21,7 @@ mod parameters;
 mod parts;
 pub mod path;
 pub mod randomness;
+pub mod settings;
 pub mod task;
 pub mod text;
 pub mod transition;

@@ -1,10 +1,11 @@
 //! Tasks: named sets of worlds with completely fixed settings, on which results can be compared.
 
 use crate::built_in::{TASKS, listed, state_names};
-use crate::grid::Cell;
 use crate::parameters::Model;
+use crate::settings::{SettingError, Settings, WorldSettings};
 use crate::text::{parse_problem, read_text, shortened};
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
+use serde_json::{Map, Value};
 use std::ops::Range;
 use std::path::Path;
 use thiserror::Error;
@@ -15,55 +16,29 @@ pub const MAX_SEEDS: u64 = 100_000;
 /// The first seed of worlds for training. Lower seeds are for tests, and nothing may be trained or tuned on them.
 pub const FIRST_TRAINING_SEED: u64 = 1000;
 
-/// The server settings that define a task's worlds, by their names in `config/server.toml`, and the seeds to test on.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A named set of worlds, and the seeds to test on.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Task {
     /// The built-in name or the file path from which the task was loaded.
-    #[serde(skip)]
     pub source: String,
     /// Name of the task.
     pub name: String,
-    /// A built-in model or a model file. Empty if the states were recorded.
-    #[serde(default)]
-    pub model: String,
-    /// Built-in recorded states, or a file of recorded states. Empty if a model simulates the worlds.
-    #[serde(default)]
-    pub states: String,
-    /// Whether the seed also selects a symmetry of the grid (a rotation or reflection).
-    #[serde(default)]
-    pub states_symmetries: bool,
-    /// The maximum recorded step at which an episode begins; the seed draws one from 0 to this.
-    #[serde(default)]
-    pub states_offset: u64,
-    /// Grid height in cells; 0 if the recorded states determine it.
-    #[serde(default)]
-    pub height: usize,
-    /// Grid width in cells; 0 if the recorded states determine it.
-    #[serde(default)]
-    pub width: usize,
-    /// Number of rows and columns that robots see beyond each cell of their path; -1 for the radius of the model's
-    /// sensor.
-    #[serde(default = "as_model_says")]
-    pub sensor_radius: i64,
-    /// Number of moves in a path.
-    pub moves: usize,
-    /// Number of robots in each world.
-    #[serde(default = "one")]
-    pub robots: u32,
-    /// Number of steps simulated before k = 0.
-    #[serde(default)]
-    pub burn_in: u64,
-    /// The robots' first cells.
-    #[serde(default)]
-    pub start: Start,
-    /// Number of steps in an episode.
-    pub max_steps: u64,
+    /// All settings of the worlds. Settings that recorded states decide are empty or 0.
+    pub world: WorldSettings,
     /// Seeds of the worlds to test on.
     pub test_seeds: Range<u64>,
     /// The task's entry in lists of the built-in tasks.
-    #[serde(default)]
     pub listing: Option<Listing>,
+}
+
+/// A task file.
+#[derive(Deserialize)]
+struct TaskFile {
+    name: String,
+    test_seeds: Range<u64>,
+    listing: Option<Listing>,
+    #[serde(flatten)]
+    given: Map<String, Value>,
 }
 
 /// A built-in task's entry in lists of tasks.
@@ -79,23 +54,6 @@ pub struct Listing {
     pub version: u32,
 }
 
-/// The robots' cells after a reset.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Start {
-    /// The corners, in the order (0, 0), opposite, upper right, lower left. Further robots start at the middles of the
-    /// sides, then at the corners again.
-    #[default]
-    Corner,
-    /// All robots in the middle.
-    Centre,
-    /// Cells drawn from the world's seed.
-    Random,
-    /// All robots in this cell.
-    #[serde(untagged)]
-    At(Cell),
-}
-
 /// The error for a task that cannot be loaded.
 #[derive(Debug, Error)]
 #[error("task {}: {problem}", shortened(task))]
@@ -105,11 +63,6 @@ pub struct TaskError {
 }
 
 impl Task {
-    /// Returns the radius of the sensor, or `None` for the radius of the model's sensor.
-    pub fn radius(&self) -> Option<usize> {
-        self.sensor_radius.try_into().ok()
-    }
-
     /// Loads the built-in task with this name, or the task file at this path.
     ///
     /// # Errors
@@ -146,11 +99,6 @@ impl Task {
         files.into_iter()
     }
 
-    /// Returns whether the hidden states were recorded.
-    pub fn is_recorded(&self) -> bool {
-        !self.states.is_empty()
-    }
-
     fn read(path: &Path) -> Result<Self, String> {
         check_kind(path)?;
         let text = read_text(path).map_err(|error| {
@@ -175,11 +123,12 @@ impl Task {
             ));
         }
         let folder = path.parent().unwrap_or(Path::new(""));
-        let is_model = Model::built_in(&task.model).is_some();
-        let is_states = state_names().any(|name| name == task.states);
+        let world = &mut task.world;
+        let is_model = Model::built_in(&world.model).is_some();
+        let is_states = state_names().any(|name| name == world.states);
         for (setting, file, is_built_in) in [
-            ("model", &mut task.model, is_model),
-            ("states", &mut task.states, is_states),
+            ("model", &mut world.model, is_model),
+            ("states", &mut world.states, is_states),
         ] {
             let next_to_task = folder.join(&*file);
             if file.is_empty() || !next_to_task.exists() || (is_built_in && next_to_task.is_dir()) {
@@ -197,46 +146,48 @@ impl Task {
     }
 
     fn from_toml(text: &str) -> Result<Self, String> {
-        let task: Self = toml::from_str(text).map_err(parse_problem)?;
-        task.check()?;
-        Ok(task)
+        let file: TaskFile = toml::from_str(text).map_err(parse_problem)?;
+        let world = WorldSettings::default().without_states();
+        let world = world.replaced(&file.given).map_err(|it| it.to_string())?;
+        check(&file, &world).map_err(|it| it.to_string())?;
+        Ok(Self {
+            source: String::new(),
+            name: file.name,
+            world,
+            test_seeds: file.test_seeds,
+            listing: file.listing,
+        })
     }
+}
 
-    /// Checks the settings that the server cannot check, because it replaces missing settings with defaults.
-    fn check(&self) -> Result<(), String> {
-        let needs = |setting: &str, expected: &str, got: &dyn std::fmt::Display| {
-            Err(format!("{setting}: expected {expected}, got {got}"))
-        };
-        if !is_file_name(&self.name) {
-            return needs(
-                "name",
-                "1 to 64 letters, digits, '-', '_' and '.', not starting with '.'",
-                &format!("{:?}", shortened(&self.name)),
-            );
-        }
-        if self.model.is_empty() != self.is_recorded() {
-            let got = format!("{:?} and {:?}", self.model, self.states);
-            return needs("model and states", "exactly one of them", &got);
-        }
-        let simulated = [
-            ("height", self.height as u64),
-            ("width", self.width as u64),
-            ("burn_in", self.burn_in),
-        ];
-        for (setting, got) in simulated.into_iter().filter(|_| self.is_recorded()) {
-            if got != 0 {
-                return needs(setting, "0, because the states determine it", &got);
-            }
-        }
-        if self.max_steps == 0 {
-            return needs("max_steps", "at least 1", &0);
-        }
-        let n_seeds = self.test_seeds.end.saturating_sub(self.test_seeds.start);
-        if !(1..=MAX_SEEDS).contains(&n_seeds) {
-            return needs("test_seeds", &format!("1 to {MAX_SEEDS}"), &n_seeds);
-        }
-        Ok(())
+/// Checks what a task file must give and leave out, besides the range of each setting.
+fn check(file: &TaskFile, world: &WorldSettings) -> Result<(), SettingError> {
+    let wrong =
+        |setting: &str, expected: &str, got: Value| Err(SettingError::new(setting, expected, got));
+    if !is_file_name(&file.name) {
+        let expected = "1 to 64 letters, digits, '-', '_' and '.', not starting with '.'";
+        return wrong("name", expected, format!("{:?}", file.name).into());
     }
+    if world.model.is_empty() != world.is_recorded() {
+        let got = format!("{:?} and {:?}", world.model, world.states);
+        return wrong("model and states", "exactly one of them", got.into());
+    }
+    let of_states = WorldSettings::settings().into_iter();
+    let mut of_states = of_states.filter(|it| it.of_states && world.is_recorded());
+    if let Some((name, got)) = of_states.find_map(|it| file.given.get_key_value(it.name)) {
+        return wrong(name, "to be left out, as the states decide it", got.clone());
+    }
+    if !file.given.contains_key("moves") {
+        return wrong("moves", "the number of moves in a path", "none".into());
+    }
+    if world.max_steps == 0 {
+        return wrong("max_steps", "at least 1", 0.into());
+    }
+    let n_seeds = file.test_seeds.end.saturating_sub(file.test_seeds.start);
+    if !(1..=MAX_SEEDS).contains(&n_seeds) {
+        return wrong("test_seeds", &format!("1 to {MAX_SEEDS}"), n_seeds.into());
+    }
+    Ok(())
 }
 
 /// Rejects pipes and devices: reading one may block, and it cannot be read twice.
@@ -256,14 +207,6 @@ pub fn is_file_name(name: &str) -> bool {
     (1..=64).contains(&name.len()) && name.bytes().all(is_plain) && !name.starts_with('.')
 }
 
-fn as_model_says() -> i64 {
-    -1
-}
-
-fn one() -> u32 {
-    1
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -276,10 +219,14 @@ mod tests {
         for name in Task::built_in_names() {
             let task = Task::named(name).expect(name);
             assert_eq!((&*task.name, &*task.source), (name, name));
-            let model = Model::built_in(&task.model);
-            assert_eq!(model.is_none(), task.is_recorded(), "{name}");
-            let is_states = state_names().any(|states| states == task.states);
-            assert_eq!(is_states, task.is_recorded(), "{name}");
+            let (world, is_recorded) = (&task.world, task.world.is_recorded());
+            assert_eq!(
+                Model::built_in(&world.model).is_none(),
+                is_recorded,
+                "{name}"
+            );
+            let is_states = state_names().any(|states| states == world.states);
+            assert_eq!(is_states, is_recorded, "{name}");
             let listing = task.listing.expect(name);
             places.push(listing.place);
             assert!(ids.insert(listing.ids), "{name}");
@@ -289,11 +236,11 @@ mod tests {
 
     /// Each row: a built-in task => a part of its file => the replacement => a part of the resulting error.
     const WRONG: &str = r#"
-small => height => heigth => unknown field `heigth`
-small => moves = 16 =>  => missing field `moves`
+small => height => heigth => heigth: expected the name of a setting (burn_in, height,
+small => moves = 16 =>  => moves: expected the number of moves in a path, got none
 small => model => states = "a.npz", model => model and states: expected exactly one
-jacksboro => moves = 64 => moves = 64, height = 3 => height: expected 0, because
-jacksboro => moves = 64 => moves = 64, burn_in = 3 => burn_in: expected 0, because
+jacksboro => moves = 64 => moves = 64, height = 3 => height: expected to be left out, as the states
+jacksboro => moves = 64 => moves = 64, burn_in = 3 => burn_in: expected to be left out, as the states
 small => max_steps = 300 => max_steps = 0 => max_steps: expected at least 1, got 0
 small => name = "small" => name = "" => name: expected 1 to 64
 small => name = "small" => name = "../small" => name: expected 1 to 64

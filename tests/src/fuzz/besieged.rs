@@ -11,6 +11,7 @@ use emberwatch_protocol::message::{
 };
 use emberwatch_protocol::path::path_to_bytes;
 use emberwatch_protocol::payload::split_step_payload;
+use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::results::{robot_result, world_result};
 use emberwatch_sim::simulator::{
@@ -91,14 +92,17 @@ impl Siege {
     fn begin() -> Self {
         let config = ServerConfig {
             worlds: N_WORLDS,
-            robots: N_ROBOTS as u32,
             deadline_millis: DEADLINE.as_millis() as u64,
-            height: 2,
-            width: 3,
-            moves: N_MOVES,
-            burn_in: 0,
-            max_steps: 40,
             coverage: CoverageRule::Client,
+            world: WorldSettings {
+                robots: N_ROBOTS as u32,
+                height: 2,
+                width: 3,
+                moves: N_MOVES,
+                burn_in: 0,
+                max_steps: 40,
+                ..WorldSettings::default()
+            },
             ..ServerConfig::default()
         };
         let threads = ThreadPoolBuilder::new().num_threads(1).build();

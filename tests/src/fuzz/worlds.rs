@@ -6,6 +6,7 @@ use emberwatch_protocol::Move;
 use emberwatch_protocol::message::{FrameHeader, RobotResult, VERSION};
 use emberwatch_protocol::observer::Sample;
 use emberwatch_protocol::recording::{Event, Reader, Record, Writer};
+use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::snapshot::{NewEpisode, SnapshotWorld, WorldSpec, decode, encode};
 use emberwatch_sim::states_file::Sequences;
@@ -28,12 +29,15 @@ fn spec() -> &'static WorldSpec {
     static SPEC: OnceLock<WorldSpec> = OnceLock::new();
     SPEC.get_or_init(|| {
         let config = ServerConfig {
-            height: 2,
-            width: 3,
-            moves: 2,
-            burn_in: 5,
             history: 3,
-            robots: 2,
+            world: WorldSettings {
+                height: 2,
+                width: 3,
+                moves: 2,
+                burn_in: 5,
+                robots: 2,
+                ..WorldSettings::default()
+            },
             ..ServerConfig::default()
         };
         let checked = config.check().expect("valid settings");

@@ -3,6 +3,7 @@ use crate::config::ServerConfig;
 use emberwatch_messages::client::{Claim, Client, Observation};
 use emberwatch_messages::control::{Request, WorldSeed};
 use emberwatch_model::path::Move;
+use emberwatch_model::settings::WorldSettings;
 use serde_json::{Value, json};
 use std::fmt::Debug;
 
@@ -11,11 +12,14 @@ const LONG: Duration = Duration::from_secs(60);
 fn client(n_worlds: u32, burn_in: u64) -> Client<Embedded> {
     let config = ServerConfig {
         worlds: n_worlds,
-        height: 7,
-        width: 5,
-        moves: 4,
-        burn_in,
-        model: "wildfire-small".into(),
+        world: WorldSettings {
+            height: 7,
+            width: 5,
+            moves: 4,
+            burn_in,
+            model: "wildfire-small".into(),
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     };
     let worlds = Embedded::new(config.check().expect("settings")).expect("worlds");
@@ -117,8 +121,11 @@ fn an_interrupted_wait_leaves_its_worlds_to_the_next_call() {
 fn worlds_that_do_not_fit_in_memory_are_refused() {
     let config = ServerConfig {
         worlds: 1024,
-        height: 4096,
-        width: 4096,
+        world: WorldSettings {
+            height: 4096,
+            width: 4096,
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     };
     let refused = Embedded::new(config.check().expect("settings"));

@@ -16,6 +16,7 @@ use emberwatch_messages::message::{
 };
 use emberwatch_messages::payload::{split_step_payload, write_step_body};
 use emberwatch_model::Move;
+use emberwatch_model::settings::WorldSettings;
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
 
@@ -44,13 +45,16 @@ impl Lab {
     fn new(deadline: Duration) -> Self {
         let config = ServerConfig {
             worlds: 2,
-            robots: 3,
             deadline_millis: deadline.as_millis() as u64,
-            height: 4,
-            width: 5,
-            moves: N_MOVES,
-            burn_in: 200,
             lease_millis: LEASE.as_millis() as u64,
+            world: WorldSettings {
+                robots: 3,
+                height: 4,
+                width: 5,
+                moves: N_MOVES,
+                burn_in: 200,
+                ..WorldSettings::default()
+            },
             ..ServerConfig::default()
         };
         let (mut simulator, jobs) = new_simulator(config);

@@ -70,7 +70,7 @@ impl Simulator {
         next_token: Box<dyn FnMut() -> u64 + Send>,
     ) -> Result<(Self, Vec<ResetJob>), ModelError> {
         let config = &checked.config;
-        let (n_worlds, team) = (config.worlds as usize, config.robots as usize);
+        let (n_worlds, team) = (config.worlds as usize, config.world.robots as usize);
         let start = |world: usize| ResetJob {
             world,
             before: None,
@@ -80,7 +80,7 @@ impl Simulator {
         let jobs: Vec<ResetJob> = (0..n_worlds).map(start).collect();
         let place = |job| Place {
             slot: Slot::resetting(job, team),
-            barrier: Barrier::new(team, config.moves),
+            barrier: Barrier::new(team, config.world.moves),
         };
         let (n_robots, n_cells) = (n_worlds * team, checked.shape.n_cells());
         let simulator = Self {

@@ -9,6 +9,7 @@ use crate::config::ServerConfig;
 use emberwatch_messages::control::Reply;
 use emberwatch_messages::message::{Operation, Status, StepRequest, VERSION};
 use emberwatch_messages::payload::write_step_body;
+use emberwatch_model::settings::WorldSettings;
 use std::time::{Duration, Instant};
 
 const US: ClientId = ClientId { node: 1, pid: 7 };
@@ -20,11 +21,14 @@ const LEASE: Duration = Duration::from_secs(20);
 fn start() -> (Simulator, Vec<ResetJob>) {
     new_simulator(ServerConfig {
         worlds: 2,
-        height: 3,
-        width: 5,
-        moves: 2,
-        burn_in: 20,
         lease_millis: LEASE.as_millis() as u64,
+        world: WorldSettings {
+            height: 3,
+            width: 5,
+            moves: 2,
+            burn_in: 20,
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     })
 }

@@ -6,10 +6,11 @@ use crate::world::Rules;
 use bincode::{Decode, Encode};
 use emberwatch_model::hazards::Hazards;
 use emberwatch_model::maps::Maps;
+use emberwatch_model::settings::{Setting, Settings as _, WorldSettings};
 use emberwatch_model::text::shortened;
 use emberwatch_model::{ModelError, ModelFile};
 use sha2::{Digest, Sha256};
-use std::fmt::Display;
+use std::fmt::Debug;
 
 /// Key of the setting that contains the task's name. It is the last setting, and exists only if a task determines the
 /// worlds' settings.
@@ -48,12 +49,12 @@ impl WorldSpec {
         let mut rules = Rules::new(
             model,
             *shape,
-            config.burn_in,
-            config.max_steps,
-            config.start,
+            config.world.burn_in,
+            config.world.max_steps,
+            config.world.start,
         )?;
-        (rules.history, rules.n_moves) = (config.history as usize, config.moves);
-        rules.n_robots = config.robots as usize;
+        (rules.history, rules.n_moves) = (config.history as usize, config.world.moves);
+        rules.n_robots = config.world.robots as usize;
         if let Some(states) = recorded {
             rules = rules.with_recorded(states.recorded.clone());
         }
@@ -70,31 +71,28 @@ impl Settings {
             maps: None,
             ..checked.model.file().clone()
         };
-        let text = |value: &dyn Display| value.to_string();
-        let others: [(&str, String); 8] = [
-            ("height", text(&checked.shape.height())),
-            ("width", text(&checked.shape.width())),
-            ("moves", text(&config.moves)),
-            ("robots", text(&config.robots)),
-            ("burn_in", text(&config.burn_in)),
-            ("max_steps", text(&config.max_steps)),
-            ("coverage", format!("{:?}", config.coverage).to_lowercase()),
-            ("start", format!("{:?}", config.start).to_lowercase()),
-        ];
-        let of_states = checked.recorded.iter().flat_map(|states| {
+        let (values, recorded) = (config.values(), checked.recorded.as_ref());
+        let sequences = recorded.map_or_else(String::new, |states| {
             let n_sequences = states.recorded.n_sequences();
-            let sequences = format!("{n_sequences} sequences of CRC-32 {:08x}", states.checksum);
-            [
-                ("states", sequences),
-                ("states_symmetries", text(&config.states_symmetries)),
-                ("states_offset", text(&config.states_offset)),
-            ]
+            format!("{n_sequences} sequences of CRC-32 {:08x}", states.checksum)
+        });
+        let lowercase = |value: &dyn Debug| format!("{value:?}").to_lowercase();
+        let of_world = WorldSettings::settings().into_iter();
+        let of_world = of_world.filter(|it| recorded.is_some() || !it.for_states);
+        let of_world = of_world.flat_map(|Setting { name, .. }| match name {
+            "model" | "sensor_radius" => vec![], // The model's text contains both.
+            "states" => vec![(name, sequences.clone())],
+            "start" => vec![
+                ("coverage", lowercase(&config.coverage)),
+                (name, lowercase(&config.world.start)),
+            ],
+            _ => vec![(name, values[name].to_string())],
         });
         let maps = checked.model.hazards().map(Hazards::maps);
         let maps = maps.filter(|maps| !maps.is_empty());
         let maps = maps.map(|maps| ("maps", digest(maps)));
         let task = checked.task.iter().map(|task| (TASK, task.name.clone()));
-        let others = others.into_iter().chain(of_states).chain(maps).chain(task);
+        let others = of_world.chain(maps).chain(task);
         Self {
             model: toml::to_string(&file).expect("invariant: a model was read from TOML"),
             others: others.map(|(name, value)| (name.into(), value)).collect(),

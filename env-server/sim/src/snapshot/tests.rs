@@ -5,7 +5,8 @@ use super::settings::{Settings, WorldSpec};
 use crate::config::ServerConfig;
 use crate::world::{Episode, Flown, Rules, SavedWorld};
 use emberwatch_messages::control::CoverageRule;
-use emberwatch_model::task::Start;
+use emberwatch_model::settings::Start;
+use emberwatch_model::settings::WorldSettings;
 use emberwatch_model::{Airspace, Cell, Grid, Move};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -17,12 +18,15 @@ const NEW: NewEpisode = NewEpisode {
 
 fn spec() -> WorldSpec {
     let config = ServerConfig {
-        height: 3,
-        width: 5,
-        moves: 2,
-        robots: 2,
-        burn_in: 300,
         history: 4,
+        world: WorldSettings {
+            height: 3,
+            width: 5,
+            moves: 2,
+            robots: 2,
+            burn_in: 300,
+            ..WorldSettings::default()
+        },
         ..ServerConfig::default()
     };
     let checked = config.check().expect("valid settings");
@@ -190,9 +194,12 @@ fn a_fingerprint_differs_exactly_where_the_worlds_differ() {
     type Change = fn(&mut ServerConfig);
     let fingerprint = |change: Change| {
         let mut config = ServerConfig {
-            model: "wildfire-small".into(),
-            height: 8,
-            width: 8,
+            world: WorldSettings {
+                model: "wildfire-small".into(),
+                height: 8,
+                width: 8,
+                ..WorldSettings::default()
+            },
             ..ServerConfig::default()
         };
         change(&mut config);
@@ -202,7 +209,7 @@ fn a_fingerprint_differs_exactly_where_the_worlds_differ() {
     let usual = fingerprint(|_| ());
     assert_eq!(usual.len(), 16);
     let same: [Change; 5] = [
-        |config| config.max_steps = 7,
+        |config| config.world.max_steps = 7,
         |config| config.worlds = 3,
         |config| config.seed = 9,
         |config| config.publish_truth = true,
@@ -212,14 +219,14 @@ fn a_fingerprint_differs_exactly_where_the_worlds_differ() {
         assert_eq!(fingerprint(change), usual, "{index}");
     }
     let other: [Change; 9] = [
-        |config| config.height = 9,
-        |config| config.width = 9,
-        |config| config.moves = 5,
-        |config| config.robots = 2,
-        |config| config.burn_in = 11,
-        |config| config.start = Start::Random,
-        |config| config.model = "wildfire".into(),
-        |config| config.sensor_radius = 1,
+        |config| config.world.height = 9,
+        |config| config.world.width = 9,
+        |config| config.world.moves = 5,
+        |config| config.world.robots = 2,
+        |config| config.world.burn_in = 11,
+        |config| config.world.start = Start::Random,
+        |config| config.world.model = "wildfire".into(),
+        |config| config.world.sensor_radius = 1,
         |config| config.coverage = CoverageRule::Full,
     ];
     let mut all: BTreeSet<String> = other.into_iter().map(fingerprint).collect();

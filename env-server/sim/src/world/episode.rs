@@ -235,7 +235,7 @@ fn count(states: &Grid<u8>, wanted: u8) -> u32 {
 mod tests {
     use super::*;
     use emberwatch_model::path::fly;
-    use emberwatch_model::task::Start;
+    use emberwatch_model::settings::Start;
     use emberwatch_model::{Cell, Model, Move, Shape};
 
     fn rules(max_steps: u64, start: Start) -> Rules {

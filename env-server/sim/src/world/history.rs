@@ -165,7 +165,7 @@ mod tests {
     use crate::world::rules::Rules;
     use crate::world::{Episode, Flown};
     use emberwatch_model::frame::{Frame, UNOBSERVED};
-    use emberwatch_model::task::Start;
+    use emberwatch_model::settings::Start;
     use emberwatch_model::{Model, Move, Shape};
 
     #[test]

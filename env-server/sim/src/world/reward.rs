@@ -51,7 +51,7 @@ mod tests {
     use super::*;
     use crate::world::robot::Scratch;
     use emberwatch_model::randomness::split_mix;
-    use emberwatch_model::task::Start;
+    use emberwatch_model::settings::Start;
     use emberwatch_model::{Coverage, Model, Move, Shape};
     use std::collections::BTreeSet;
 

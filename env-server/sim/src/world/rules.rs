@@ -7,7 +7,7 @@ use super::sensor::Sensor;
 use super::starts::{fixed_start, random_starts};
 use emberwatch_model::ModelError;
 use emberwatch_model::randomness::{Purpose, stream};
-use emberwatch_model::task::Start;
+use emberwatch_model::settings::Start;
 use emberwatch_model::{Airspace, Cell, Dynamics, Model, Shape};
 use rand::RngExt;
 use std::sync::Arc;

@@ -1,7 +1,7 @@
 //! The cells where robots start, and the number of free cells that they can reach from there.
 
 use emberwatch_model::Parts;
-use emberwatch_model::task::Start;
+use emberwatch_model::settings::Start;
 use emberwatch_model::{Airspace, Cell, Shape};
 use std::collections::BTreeSet;
 use std::fmt::{Display, Formatter};
