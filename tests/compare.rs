@@ -48,7 +48,7 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     }
     for (name, words) in [
         ("ladder.svg", "\nbeam"),
-        ("rewards.svg", "\nbeam"),
+        ("rewards.svg", "\nknown/beam/exploit"),
         ("agent.toml", "beam_width = 4"),
     ] {
         let text = folder.text(&format!("figures/{name}"));
