@@ -47,8 +47,8 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
         }
     }
     for (name, words) in [
-        ("ladder.svg", "\nbeam exploit"),
-        ("rewards.svg", "\nbeam exploit"),
+        ("ladder.svg", "\nbeam"),
+        ("rewards.svg", "\nknown/beam/exploit"),
         ("agent.toml", "beam_width = 4"),
     ] {
         let text = folder.text(&format!("figures/{name}"));
@@ -93,7 +93,7 @@ fn without_hidden_states_what_needs_them_is_empty() {
 
 #[test]
 fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
-    let alone = compare(&format!("{LIVELY} --policies known/beam/exploit"));
+    let alone = compare(&format!("{LIVELY} --policies beam"));
     let rows = compare(&format!(
         "{LIVELY} --robots 1,3 --team alone,shared,joint,oracle"
     ));

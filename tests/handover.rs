@@ -190,7 +190,7 @@ fn a_left_belief_goes_whole_to_its_robot_and_step_only() {
 #[test]
 fn an_agent_told_to_stop_leaves_its_belief() {
     let server = Server::start(FLAGS);
-    let agent = run(&server, "--steps 0");
+    let agent = run(&server, "--steps 0 --policy known/beam/exploit");
     agent.until(|| server.step_of(0) > 5);
     agent.finish();
     assert_eq!(server.holder(), None, "it releases its world");

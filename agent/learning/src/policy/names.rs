@@ -150,11 +150,6 @@ pub fn planner_of(name: &str) -> Option<&'static PlannerKind> {
     parse(name, &|_| Some(0), "").ok().map(|parts| parts.1)
 }
 
-/// Returns the belief of the policy with this name. `None` if the name is unknown, as for an external agent's policy.
-pub fn belief_of(name: &str) -> Option<&'static BeliefKind> {
-    parse(name, &|_| Some(0), "").ok().map(|parts| parts.0)
-}
-
 type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
 
 /// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the states' names for
