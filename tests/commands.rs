@@ -2,9 +2,7 @@
 
 use emberwatch_learning::policy;
 use std::time::{Duration, Instant};
-use tests::harness::{
-    AGENT, Ended, Folder, LIMIT, Program, SERVER, SMALL, Server, new_instance, run,
-};
+use tests::harness::{AGENT, Ended, LIMIT, Program, SERVER, SMALL, Server, new_instance, run};
 
 /// Flags of a very short comparison.
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \

@@ -1,17 +1,14 @@
 //! Tests of agents that are killed or stopped in the middle of a step, which must not change their world.
 
-use emberwatch_protocol::channels::{ChannelError, Instance};
+use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::Claim;
-use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::{Reply, Request};
 use emberwatch_protocol::message::{Status, StepRequest};
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::{Client, Connection};
 use rustix::process::Signal;
 use std::time::Duration;
-use tests::harness::{
-    AGENT, PATIENCE, Program, Server, eventually, fly_on, frames_until, seen_in, status,
-};
+use tests::harness::{PATIENCE, Program, Server, eventually, fly_on, frames_until, seen_in};
 use tests::mirror::Mirror;
 use tests::wire::{
     RawClient, Wire, acquire_request, answer, control_header, step_body, step_header,
