@@ -60,11 +60,7 @@ fn a_training_that_made_no_update_says_why() {
         let ended = place.train(&out, &format!("{WORLDS} {flags}"));
         ended.check_says(&format!("{none} {cause}"));
     }
-    for (flags, is_told) in [
-        ("--steps 60", false),
-        ("--steps 4 --resume --freeze", false),
-        ("--steps 4 --resume", true),
-    ] {
+    for (flags, is_told) in [("--steps 60", false), ("--steps 4 --resume", true)] {
         let ended = place.train("learned", &format!("{WORLDS} {flags}"));
         assert_eq!(ended.stderr.contains(none), is_told, "{}", ended.stderr);
     }
@@ -166,21 +162,9 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
 fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let place = place();
     let before = place.learn("out", &format!("{WORLDS} --steps 80"));
-    let checkpoint = place.bytes("out");
     place.refuse("out", WORLDS, "--out | add --resume");
-    let flags = format!("{WORLDS} --steps 80 --resume --freeze");
-    assert_eq!(place.learn("out", &flags), before, "metrics of learning");
-    assert!(
-        place.bytes("out") == checkpoint,
-        "frozen parameters changed"
-    );
-    assert_eq!(place.folder.text("out/frozen.csv").lines().count(), 1 + 40);
     let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
     ended.check_says("beliefs start anew robots=2");
-    let files = std::fs::read_dir(place.folder.path("out")).expect("the folder");
-    let names = files.map(|file| file.expect("a file").file_name());
-    let runs = names.filter(|name| name.to_string_lossy().contains(".tfevents."));
-    assert_eq!(runs.count(), 2, "one file for each run that learned");
     let rows = place.rows("out");
     let [last, first] = [before.len() - 1, before.len()].map(|row| &rows[row]);
     assert_eq!(first[1], "82", "world steps go on");
@@ -304,7 +288,6 @@ fn a_checkpoint_is_compared_and_checked() {
 const WRONG_FLAGS: &str = "
 train => --out
 train --out /proc/no => create /proc/no
-train --out /tmp --freeze => --resume
 train --out OUT --worlds 0 => --worlds | 1..=1024
 train --out OUT --instance nobody => no server on instance \"nobody\"
 train --out OUT --instance x --height 9 => --instance | --height

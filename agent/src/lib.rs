@@ -5,7 +5,7 @@
 //! - [`cli`] and `commands` -- the command line and its subcommands
 //! - [`benchmark`] -- runs and scores policies on the same worlds
 //! - [`acting`] -- acts on one world of a running server
-//! - `training` -- trains learners while they act, with metrics and events
+//! - `training` -- trains learners while they act, with metrics
 //! - [`charts`] -- charts as SVG
 //! - [`client`] -- communication with the server
 //! - `flags` -- flags for the agent's settings

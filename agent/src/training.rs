@@ -4,19 +4,15 @@
 //! server reveals is read only for decisions on a known-model belief. One request moves all robots by one step. The [`Learner`] determines what is learned, and how to act in the meantime.
 
 mod acting;
-mod events;
-mod heat;
 pub mod metrics;
 pub mod seconds;
 mod spec;
-pub mod tensorboard;
 
 pub use self::spec::{CHECKPOINT, TrainingSpec};
 
 use self::acting::Acting;
-use self::events::Events;
 use crate::client::worlds::Worlds;
-use crate::training::metrics::{FROZEN, METRICS, Metrics, Tick};
+use crate::training::metrics::{METRICS, Metrics, Tick};
 use crate::training::seconds::Stopwatch;
 use anyhow::{Context, Result, bail};
 use emberwatch_belief::estimation::scoring::Score;
@@ -30,9 +26,6 @@ use emberwatch_protocol::control::WorldSeed;
 use emberwatch_protocol::feed::Feed;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-
-/// Subfolder for the TensorBoard events of a run without learning.
-const FROZEN_EVENTS: &str = "frozen";
 
 /// Minimum time between two checkpoints during training.
 const SAVE_INTERVAL: Duration = Duration::from_secs(30);
@@ -73,7 +66,7 @@ pub fn train(
             bail!("{problem:#}; the training since the last checkpoint is lost: {also:#}");
         }
     }
-    training_loop.warn_of_no_update(spec);
+    training_loop.warn_of_no_update();
     training_loop.client.release()?;
     training_loop.feed.end();
     Ok(training_loop.summary)
@@ -84,7 +77,6 @@ struct TrainingLoop<'a> {
     kind: &'static LearnerKind,
     learner: Box<dyn Learner>,
     metrics: Metrics,
-    events: Events,
     stopwatch: Stopwatch,
     feed: Feed,
     summary: TrainSummary,
@@ -123,10 +115,6 @@ impl<'a> TrainingLoop<'a> {
         let kind = spec.learner()?;
         let mut learner = begin(spec, kind, &client, contents.as_ref())?;
         let metrics = metrics(spec, kind, &*learner)?;
-        let events = events(spec, &*learner)?;
-        if spec.freeze {
-            learner.freeze();
-        }
         let attached = learner.attach(running(&mut client)?);
         let n_resumed = attached.map_err(|problem| spec.stopped(problem, &*learner))?;
         let n_new = client.robots().len() - n_resumed;
@@ -146,7 +134,6 @@ impl<'a> TrainingLoop<'a> {
             n_before: learner.n_updates(),
             learner,
             metrics,
-            events,
             stopwatch,
             feed,
             summary: TrainSummary::default(),
@@ -162,11 +149,7 @@ impl<'a> TrainingLoop<'a> {
             let tick = self.step();
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             let start = Instant::now();
-            let updates = if spec.freeze {
-                Ok(Vec::new())
-            } else {
-                self.learner.learn()
-            };
+            let updates = self.learner.learn();
             self.summary.learning += start.elapsed();
             let mut updates = updates.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             self.summary.updates = self.learner.n_updates();
@@ -175,8 +158,6 @@ impl<'a> TrainingLoop<'a> {
                 updates.push(ModelUpdate::nothing(self.summary.updates, n_more));
             }
             self.metrics.add(&tick, &updates)?;
-            self.events
-                .add(&tick, &updates, self.kind.columns, &*self.learner)?;
             self.report(&tick, spec.steps);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(spec)?;
@@ -205,25 +186,22 @@ impl<'a> TrainingLoop<'a> {
         Ok(tick)
     }
 
-    /// Writes the metrics and, unless learning is frozen, the checkpoint.
+    /// Writes the metrics and the checkpoint.
     fn save(&mut self, spec: &TrainingSpec) -> Result<()> {
         self.saved = Instant::now();
-        if !spec.freeze {
-            let contents = self.learner.contents();
-            let mut contents = contents.map_err(|error| spec.stopped(error, &*self.learner))?;
-            contents.settings = toml::to_string(&spec.config)?;
-            let place = spec.out.join(CHECKPOINT);
-            checkpoint::write(&place, self.kind.checkpoint, &contents)?;
-            self.stopwatch.write()?;
-        }
-        self.metrics.flush()?;
-        self.events.flush()
+        let contents = self.learner.contents();
+        let mut contents = contents.map_err(|error| spec.stopped(error, &*self.learner))?;
+        contents.settings = toml::to_string(&spec.config)?;
+        let place = spec.out.join(CHECKPOINT);
+        checkpoint::write(&place, self.kind.checkpoint, &contents)?;
+        self.stopwatch.write()?;
+        self.metrics.flush()
     }
 
-    /// Warns if a run that is not frozen made no update.
-    fn warn_of_no_update(&self, spec: &TrainingSpec) {
+    /// Warns if the run made no update.
+    fn warn_of_no_update(&self) {
         let steps = self.summary.steps;
-        if !spec.freeze && steps > 0 && self.learner.n_updates() == self.n_before {
+        if steps > 0 && self.learner.n_updates() == self.n_before {
             let cause = self.learner.lacks(steps);
             tracing::warn!("nothing was learned in {steps} world steps: {cause}");
         }
@@ -282,7 +260,6 @@ fn begin(
         contents,
         learned: &spec.learned,
         device: &spec.device,
-        is_frozen: spec.freeze,
     });
     match contents {
         None => learner,
@@ -339,21 +316,13 @@ fn reset(
     Ok(seen)
 }
 
-/// Opens the metrics file. A run without learning has a separate file.
+/// Opens the metrics file.
 fn metrics(spec: &TrainingSpec, kind: &LearnerKind, learner: &dyn Learner) -> Result<Metrics> {
     let (columns, world_steps) = (kind.columns, learner.world_steps());
-    match (spec.freeze, spec.resume) {
-        (true, _) => Metrics::begin(&spec.out.join(FROZEN), columns),
-        (false, true) => Metrics::reopen(&spec.out.join(METRICS), columns, world_steps),
-        (false, false) => Metrics::begin(&spec.out.join(METRICS), columns),
-    }
-}
-
-/// Opens the file of TensorBoard events. A run without learning has a separate folder, and starts from step 0.
-fn events(spec: &TrainingSpec, learner: &dyn Learner) -> Result<Events> {
-    match (spec.freeze, spec.resume) {
-        (true, _) => Events::begin(&spec.out.join(FROZEN_EVENTS), 0),
-        (false, true) => Events::begin(&spec.out, learner.world_steps()),
-        (false, false) => Events::begin(&spec.out, 0),
+    let path = spec.out.join(METRICS);
+    if spec.resume {
+        Metrics::reopen(&path, columns, world_steps)
+    } else {
+        Metrics::begin(&path, columns)
     }
 }

@@ -5,7 +5,6 @@
 
 mod columns;
 pub mod common_worlds;
-pub(crate) mod events;
 pub mod figures;
 pub mod leaderboard;
 pub mod leaderboard_chart;
@@ -20,7 +19,6 @@ pub(crate) mod table;
 mod teams;
 pub mod training;
 
-pub use self::events::write_events;
 pub use self::figures::{draw_ladder, draw_rewards, draw_teams, save};
 pub use self::policy_run::{ALONE, PolicyRun, groups};
 pub use self::table::render_table;

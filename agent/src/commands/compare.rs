@@ -8,7 +8,7 @@ use crate::benchmark::report::common_worlds::check_worlds;
 use crate::benchmark::report::runs_file::{read_runs, write_runs};
 use crate::benchmark::report::{
     PolicyRun, draw_ladder, draw_rewards, draw_teams, figures::FIRE_CELLS_PER_STEP, groups,
-    render_table, write_events,
+    render_table,
 };
 use crate::benchmark::team::Team;
 use crate::flags::AgentFlags;
@@ -68,9 +68,6 @@ pub struct CompareCommand {
     /// Draw ladder.svg, rewards.svg and teams.svg into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
-    /// Write the reward of each step for TensorBoard into this directory, with one run per policy
-    #[arg(long, value_name = "DIR")]
-    tensorboard: Option<PathBuf>,
     /// Start known-model beliefs from each world's hidden state, instead of --prior
     #[arg(long, conflicts_with = "prior")]
     first_state_known: bool,
@@ -147,9 +144,6 @@ impl CompareCommand {
             write_runs(csv, &all)?;
         }
         write(&render_table(&all, &report.baseline))?;
-        if let Some(directory) = &self.tensorboard {
-            write_events(directory, &report.runs)?;
-        }
         match &self.figures {
             Some(directory) => draw(directory, report, &all, config),
             None => Ok(()),
@@ -204,10 +198,9 @@ impl CompareCommand {
         Ok(())
     }
 
-    /// Checks the CSV file and creates the folders for figures and events.
+    /// Checks the CSV file and creates the folder for figures.
     fn make_places(&self) -> Result<()> {
-        let folders = [self.figures.as_deref(), self.tensorboard.as_deref()];
-        folders.into_iter().flatten().try_for_each(make_folder)?;
+        self.figures.as_deref().map_or(Ok(()), make_folder)?;
         self.csv.as_deref().map_or(Ok(()), check_csv)
     }
 

@@ -78,9 +78,6 @@ pub struct TrainCommand {
     /// Cells that frames show to a filter in training [default: from the settings; with --resume: the checkpoint's]
     #[arg(long = "coverage", value_name = "CELLS", value_parser = one_of(&COVERAGES))]
     full_frames: Option<bool>,
-    /// Act with the checkpoint's parameters, without learning
-    #[arg(long, requires = "resume")]
-    freeze: bool,
     /// Device for an autoencoder or a neural belief: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
@@ -152,7 +149,6 @@ impl TrainCommand {
             deadline: None,
             out: self.out.clone(),
             resume: self.resume,
-            freeze: self.freeze,
             learned,
             device,
             config,
@@ -203,11 +199,6 @@ impl TrainCommand {
             && self.resume
             && let Some(belief) = training.adopt_belief()?
         {
-            ensure!(
-                !self.freeze,
-                "--freeze: expected a checkpoint of decisions in {}, got only one of their belief",
-                self.out.display()
-            );
             self.adopt_estimator(belief, training)?;
             return Ok(None);
         }
@@ -234,7 +225,7 @@ impl TrainCommand {
     /// Limits a resumed training to the remaining steps of the settings, unless `--steps` is given.
     fn limit_steps(&self, done: u64, training: &mut TrainingSpec) -> Result<()> {
         let all = (training.learner()?.steps)(&training.config);
-        if self.steps.is_none() && !self.freeze && all > 0 {
+        if self.steps.is_none() && all > 0 {
             training.steps = all.saturating_sub(done);
             ensure!(
                 training.steps > 0,
@@ -351,7 +342,7 @@ pub(super) fn learn(
     let [planning_seconds, learning_seconds] =
         [summary.planning, summary.learning].map(|time| time.as_secs_f64());
     tracing::info!(planning_seconds, learning_seconds, "time");
-    if summary.steps > 0 && !training.freeze {
+    if summary.steps > 0 {
         draw_training(&training.out)?;
     }
     Ok(summary.steps)

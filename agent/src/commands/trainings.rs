@@ -106,7 +106,6 @@ impl Trainings<'_> {
             deadline: None,
             resume: false,
             out: self.folder.join(format!("training.{}", std::process::id())),
-            freeze: false,
             device: Device::Cpu,
             config,
             learned,

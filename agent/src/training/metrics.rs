@@ -11,9 +11,6 @@ use std::path::{Path, PathBuf};
 /// Name of the metrics file in the folder of a training.
 pub const METRICS: &str = "metrics.csv";
 
-/// Name of the metrics file of a run without learning.
-pub const FROZEN: &str = "frozen.csv";
-
 const HEADER: [&str; 6] = [
     "update",
     "world_steps",
@@ -149,25 +146,6 @@ fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Opt
     numbers.into_iter().chain(update.more.iter().copied())
 }
 
-/// Returns a step's values by column, averaged over its updates. Omits `world_steps`, and columns without a value.
-/// `more` names the learner's additional columns.
-pub fn averages(
-    tick: &Tick,
-    updates: &[ModelUpdate],
-    more: &[&'static str],
-) -> Vec<(&'static str, f64)> {
-    let rows = updates.iter().map(|update| numbers(tick, update).collect());
-    let rows: Vec<Vec<Option<f64>>> = rows.collect();
-    let mean = |(column, name): (usize, &&'static str)| {
-        let there: Vec<f64> = rows.iter().filter_map(|row| row[column]).collect();
-        let mean = there.iter().sum::<f64>() / there.len() as f64;
-        (!there.is_empty()).then_some((*name, mean))
-    };
-    let names = HEADER[2..].iter().chain(more).enumerate();
-    let counted = updates.last().map(|last| (HEADER[0], last.number as f64));
-    counted.into_iter().chain(names.filter_map(mean)).collect()
-}
-
 /// The rows of a metrics file as numbers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rows {
@@ -203,38 +181,5 @@ impl Rows {
         let at = self.names.iter().position(|known| known == name);
         let field = |row: &Vec<Option<f64>>| at.and_then(|at| row.get(at).copied().flatten());
         self.rows.iter().map(field).collect()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn values_are_averaged_over_the_updates_of_a_step() {
-        let update = |loss: f64, more: Option<f64>| ModelUpdate {
-            number: 7,
-            loss: Some(loss),
-            rate: Some(0.1),
-            more: vec![more],
-        };
-        let tick = Tick {
-            world_steps: 32,
-            n_worlds: 16,
-            reward: 48.0,
-            score: Score::default(),
-        };
-        let updates = [update(1.0, None), update(2.0, Some(5.0))];
-        let got = averages(&tick, &updates, &["dqn_loss"]);
-        let expected = [
-            ("update", 7.0),
-            ("loss", 1.5),
-            ("mean_reward", 3.0),
-            ("rate", 0.1),
-            ("dqn_loss", 5.0),
-        ];
-        assert_eq!(got, expected);
-        let without = averages(&tick, &[ModelUpdate::nothing(7, 1)], &["dqn_loss"]);
-        assert_eq!(without, [("update", 7.0), ("mean_reward", 3.0)]);
     }
 }

@@ -29,7 +29,6 @@ pub struct TrainingSpec {
     pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
-    pub freeze: bool,
     pub device: Device,
     pub config: AgentConfig,
     /// Beliefs from earlier trainings, for decisions that are based on them.

@@ -1,8 +1,7 @@
 use super::synthetic::{run, teams};
 use emberwatch_agent::benchmark::report::runs_file::{read_runs, write_runs};
 use emberwatch_agent::benchmark::report::suite::{render_suite, scores};
-use emberwatch_agent::benchmark::report::{PolicyRun, render_table, write_events};
-use std::collections::BTreeSet;
+use emberwatch_agent::benchmark::report::{PolicyRun, render_table};
 
 /// Returns runs on worlds 1, 2, 3: `coverage` earns 1, 3, 5, `beam` earns 2, 5, 8, and the oracle earns 4, 8, 8.
 fn three_policies() -> Vec<PolicyRun> {
@@ -80,18 +79,6 @@ fn teams_are_compared_with_as_many_robots_alone() {
     assert_eq!(row(&table, "beam", 6)[2..4], ["alone", "1"], "{table}");
     // One robot is not a team: the table has no columns for teams.
     assert!(!render_table(&teams(3)[..3], "beam").contains("team"));
-}
-
-#[test]
-fn each_team_has_a_folder_of_events() {
-    let directory = tempfile::tempdir().expect("a directory");
-    write_events(directory.path(), &teams(2)).expect("written");
-    let folders = std::fs::read_dir(directory.path()).expect("listed");
-    let names = folders.map(|it| it.expect("an entry").file_name());
-    let names: BTreeSet<_> = names.collect();
-    let ends = [names.first(), names.last()].map(|name| name.and_then(|name| name.to_str()));
-    assert_eq!(ends, [Some("beam-alone_1"), Some("beam-joint_4")]);
-    assert_eq!(names.len(), 6);
 }
 
 /// Returns runs on three worlds. `beam` detects the fire in all three, and sees 0.5, 0.7 and 0.9 of it. `coverage`

@@ -68,8 +68,6 @@ pub struct Beginning<'a> {
     pub learned: &'a Learned,
     /// The device on which networks compute.
     pub device: &'a Device,
-    /// Whether the learner only acts, without learning.
-    pub is_frozen: bool,
 }
 
 /// The learner's knowledge of its worlds and robots.
@@ -137,9 +135,6 @@ pub trait Learning: Actor {
 
     /// Makes the updates that are due after the steps since the last call.
     fn learn(&mut self) -> Result<Vec<ModelUpdate>>;
-
-    /// Stops exploration. From then on, the learner acts greedily.
-    fn freeze(&mut self);
 
     /// Returns the rollout of a robot, by index.
     fn rollout(&self, index: usize) -> &Rollout;

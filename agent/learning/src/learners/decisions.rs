@@ -69,7 +69,6 @@ pub struct DecisionsLearner {
     world_steps: u64,
     /// Number of updates that are due but not made yet.
     earned: f64,
-    is_frozen: bool,
 }
 
 impl DecisionsLearner {
@@ -88,7 +87,6 @@ impl DecisionsLearner {
             saved_runs: BTreeMap::new(),
             world_steps: 0,
             earned: 0.0,
-            is_frozen: false,
             worlds,
             config: config.clone(),
         };
@@ -117,9 +115,6 @@ impl DecisionsLearner {
     /// Chooses the option that a robot flies: the option with the highest value, or a random option that it keeps for
     /// some steps.
     fn choose(&self, index: usize, features: &[f32], held: &mut Held) -> usize {
-        if self.is_frozen {
-            return self.dqn.best(features);
-        }
         let step = self.world_steps + index as u64;
         let mut rng = stream(self.config.seed, Purpose::Exploration, step);
         let mut random = |below: u64| rng.next_u64() % below;
@@ -224,10 +219,8 @@ impl Learning for DecisionsLearner {
         let begun = self.begun(observation)?;
         let run = &mut self.runs[(robot - self.worlds.numbers.start) as usize];
         let mut ended = std::mem::replace(run, begun);
-        if !self.is_frozen {
-            let transitions = ended.end(&self.dqn).into_iter();
-            transitions.for_each(|transition| self.dqn.remember(transition));
-        }
+        let transitions = ended.end(&self.dqn).into_iter();
+        transitions.for_each(|transition| self.dqn.remember(transition));
         Ok(())
     }
 
@@ -249,10 +242,6 @@ impl Learning for DecisionsLearner {
             });
         }
         Ok(updates)
-    }
-
-    fn freeze(&mut self) {
-        self.is_frozen = true;
     }
 
     fn rollout(&self, index: usize) -> &Rollout {

@@ -37,7 +37,6 @@ pub struct FilterLearner {
     planned: Vec<(Belief, Plan)>,
     /// The saved state of each robot, by robot number.
     saved_robots: BTreeMap<u32, SavedRobot>,
-    is_frozen: bool,
 }
 
 pub const FILTER: LearnerKind = LearnerKind {
@@ -66,7 +65,7 @@ pub const FILTER: LearnerKind = LearnerKind {
 fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
     let dimensions = dimensions(on.config, &on.worlds)?;
     ensure!(
-        on.is_frozen || !on.config.full_frames || on.info.coverage != CoverageRule::Path,
+        !on.config.full_frames || on.info.coverage != CoverageRule::Path,
         "full_frames: expected a server with --coverage client or full, got path"
     );
     Ok(Box::new(match on.contents {
@@ -129,7 +128,6 @@ impl FilterLearner {
             config: config.clone(),
             rollouts: Vec::new(),
             planned: Vec::new(),
-            is_frozen: false,
         }
     }
 
@@ -160,11 +158,8 @@ impl FilterLearner {
         Ok(rollout)
     }
 
-    /// Returns the number of worlds whose robots move at random: first all, later a share, and none if frozen.
+    /// Returns the number of worlds whose robots move at random: first all, later a share.
     fn n_walking(&self) -> usize {
-        if self.is_frozen {
-            return 0;
-        }
         let learning = &self.config.learning;
         if self.fit.world_steps < learning.explore_steps {
             return self.rollouts.len();
@@ -175,9 +170,7 @@ impl FilterLearner {
 
 impl Actor for FilterLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
-        if !self.is_frozen {
-            self.learned = self.fit.learned();
-        }
+        self.learned = self.fit.learned();
         let (n_walking, tables) = (self.n_walking(), &self.learned.tables);
         let policy = Policy::exploiting(&LEARNED);
         let objective = policy.objective(self.learned.target, &self.config);
@@ -221,7 +214,7 @@ impl Actor for FilterLearner {
 
 impl Learning for FilterLearner {
     fn wants_full_frames(&self) -> bool {
-        !self.is_frozen && self.config.full_frames
+        self.config.full_frames
     }
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
@@ -238,10 +231,6 @@ impl Learning for FilterLearner {
             more: Vec::new(),
         };
         Ok(self.fit.learn()?.into_iter().map(update).collect())
-    }
-
-    fn freeze(&mut self) {
-        self.is_frozen = true;
     }
 
     fn rollout(&self, index: usize) -> &Rollout {

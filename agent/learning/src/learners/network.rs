@@ -47,10 +47,8 @@ fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
     if let Some(contents) = on.contents {
         progress.load(contents)?;
     }
-    if !on.is_frozen {
-        check_full_frames(&progress, on.config, on.info)?;
-        check_window(on.config, on.info)?;
-    }
+    check_full_frames(&progress, on.config, on.info)?;
+    check_window(on.config, on.info)?;
     Ok(Box::new(NetworkLearner::new(
         progress, on.worlds, on.config,
     )))
@@ -95,7 +93,6 @@ pub struct NetworkLearner {
     rollout: Option<Rollout>,
     /// The last decision, with its path.
     decision: Option<Decision>,
-    is_frozen: bool,
 }
 
 /// An action, the hidden vector from which it was chosen, its value, and its path.
@@ -116,7 +113,6 @@ impl NetworkLearner {
             config: config.clone(),
             rollout: None,
             decision: None,
-            is_frozen: false,
         }
     }
 
@@ -148,11 +144,7 @@ impl NetworkLearner {
 
     fn decide(&self) -> Decision {
         let (dqn, input) = (&self.progress.dqn, self.input());
-        let action = if self.is_frozen {
-            dqn.best(&input)
-        } else {
-            dqn.act(&input, self.progress.position.iterations)
-        };
+        let action = dqn.act(&input, self.progress.position.iterations);
         Decision {
             value: dqn.values(&input)[action],
             input,
@@ -251,7 +243,7 @@ impl Actor for NetworkLearner {
 
 impl Learning for NetworkLearner {
     fn wants_full_frames(&self) -> bool {
-        !self.is_frozen && self.progress.position.iterations < self.config.autoencoder.full_frames
+        self.progress.position.iterations < self.config.autoencoder.full_frames
     }
 
     fn begin(&mut self, _: u32, observation: Observation) -> Result<()> {
@@ -289,10 +281,6 @@ impl Learning for NetworkLearner {
             rate,
             more,
         }])
-    }
-
-    fn freeze(&mut self) {
-        self.is_frozen = true;
     }
 
     fn rollout(&self, _: usize) -> &Rollout {

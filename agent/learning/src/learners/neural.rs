@@ -68,7 +68,6 @@ pub struct NeuralLearner {
     world_steps: u64,
     /// Number of updates that are due but not made yet.
     earned: f64,
-    is_frozen: bool,
 }
 
 /// A robot in its world.
@@ -97,7 +96,6 @@ impl NeuralLearner {
             saved_runs: BTreeMap::new(),
             world_steps: 0,
             earned: 0.0,
-            is_frozen: false,
             worlds,
             config: config.clone(),
         };
@@ -191,7 +189,7 @@ impl Actor for NeuralLearner {
         let (target, first) = (self.paying(), self.worlds.numbers.start);
         let objective = Policy::exploiting(&BELIEF).objective(target, &self.config);
         let is_exploring = self.progress() < self.config.neural.explore_share;
-        let (seed, step, is_frozen) = (self.config.seed, self.world_steps, self.is_frozen);
+        let (seed, step) = (self.config.seed, self.world_steps);
         let mut runs = std::mem::take(&mut self.runs);
         let paths = in_parallel(runs.iter_mut().enumerate(), |(index, run)| {
             let (cells, k) = (run.rollout.cells(), run.rollout.step());
@@ -199,15 +197,12 @@ impl Actor for NeuralLearner {
             let mut rng = stream(seed, Purpose::Exploration, step + index as u64);
             let behaviour =
                 Behaviour::next(run.behaviour, is_exploring, self.worlds.shape(), &mut rng);
-            let plans = if is_frozen {
-                agent.plan_for(objective, &cells, k)
-            } else {
-                let seen = || self.replay.present(first + index as u32);
-                let (airspace, belief) = (&self.worlds.airspace, agent.basis_belief());
-                match behaviour.values(objective, airspace, target, belief, seen, &mut rng) {
-                    Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),
-                    None => agent.walk(&cells, k),
-                }
+            let seen = || self.replay.present(first + index as u32);
+            let (airspace, belief) = (&self.worlds.airspace, agent.basis_belief());
+            let plans = match behaviour.values(objective, airspace, target, belief, seen, &mut rng)
+            {
+                Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),
+                None => agent.walk(&cells, k),
             };
             run.behaviour = Some(behaviour);
             run.path = plans
@@ -270,10 +265,6 @@ impl Learning for NeuralLearner {
             });
         }
         Ok(updates)
-    }
-
-    fn freeze(&mut self) {
-        self.is_frozen = true;
     }
 
     fn rollout(&self, index: usize) -> &Rollout {
