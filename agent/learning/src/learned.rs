@@ -8,8 +8,6 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     values: Vec<Arc<dyn Value>>,
-    /// The digest of each checkpoint, in the order in which they were read.
-    pub digests: Vec<String>,
 }
 
 trait Value: Any + Debug + Send + Sync {}

@@ -34,7 +34,6 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
         robots: 1,
         team: "alone".into(),
         worlds_fingerprint: "884869f24f9fd933".into(),
-        policy_fingerprint: "0df41e66fd442aca".into(),
         ..PolicyRun::default()
     }
 }

@@ -159,7 +159,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
          mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
          steps_to_detection,burning_cells_at_detection,recent_steps,burning_seen_share,front_distance,\
-         grid_seen_share,log_likelihood,worlds_fingerprint,policy_fingerprint,training_seconds\n"
+         grid_seen_share,log_likelihood,worlds_fingerprint,training_seconds\n"
     ));
     // Rows are sorted by policy and world.
     runs.sort_by(|a, b| (&a.policy, a.world_seed).cmp(&(&b.policy, b.world_seed)));

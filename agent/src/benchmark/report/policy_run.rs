@@ -57,9 +57,6 @@ pub struct PolicyRun {
     pub log_likelihood: Option<f64>,
     /// The server's `worlds_fingerprint`.
     pub worlds_fingerprint: String,
-    /// Identifies everything the policy's actions depend on, except the worlds; empty unless `suite` ran the policy.
-    #[serde(default)]
-    pub policy_fingerprint: String,
     /// Processor seconds of training for the world's task, if `suite` recorded them.
     pub training_seconds: Option<f64>,
     /// The world's task, if the run is from a folder of `suite` or from the leaderboard.
