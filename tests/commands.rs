@@ -11,7 +11,7 @@ pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --
 /// Invalid flags of the server, and words of the resulting error.
 const WRONG_SERVER_FLAGS: &str = r#"
 --instance a/b => instance name | "a/b"
---worlds 1025 => worlds: expected 1 to 1024, got 1025
+--worlds 1025 => '1025' | --worlds | expected 1 to 1024
 --worlds many => 'many' | --worlds
 --worlds 1024 --robots 5 => worlds times robots: expected 1 to 4096, got 5120
 --robots 64 --height 1000 --width 1000 => cells times robots: expected | got 64000000
@@ -26,7 +26,6 @@ const WRONG_SERVER_FLAGS: &str = r#"
 --config no/such.toml => config file no/such.toml: No such file
 --config / => config file /: Is a directory
 --config /dev/zero => config file /dev/zero: expected at most 16777216 bytes
---check --worlds 0 => worlds: expected 1 to 1024, got 0
 --bogus => --bogus
 dance => dance
 --worlds 1024 --height 4096 --width 4096 => memory: expected | MiB for 1024 worlds of 4096 x 4096 cells | got

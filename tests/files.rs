@@ -23,7 +23,11 @@ fn wrong_files_are_refused_by_path_and_entry() {
     "##;
     let zero = "from-above | cell (0, 0) can sum to zero | expected a positive sum";
     for (flag, text, words) in [
-        ("--config", "wrolds = 3\n", "PATH | unknown field `wrolds`"),
+        (
+            "--config",
+            "wrolds = 3\n",
+            "PATH | wrolds: expected the name of a setting",
+        ),
         (
             "--config",
             "worlds = 'three'\n",

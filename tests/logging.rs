@@ -171,7 +171,7 @@ fn colours_follow_the_terminal_and_the_environment() {
         let variables = environment.split(' ').map(|set| set.split_once('='));
         let log_on = |stderr: OwnedFd| {
             Command::new(program_path(SERVER))
-                .args(["--check", "--worlds", "0"])
+                .args(["--check", "--states-offset", "3"])
                 .env("TERM", "xterm")
                 .env_remove("NO_COLOR")
                 .env_remove("CLICOLOR_FORCE")
@@ -191,7 +191,7 @@ fn colours_follow_the_terminal_and_the_environment() {
         reader.read_to_end(&mut piped).expect("the log");
         let are_coloured = [seen, piped].map(|log| {
             assert!(
-                String::from_utf8_lossy(&log).contains("worlds"),
+                String::from_utf8_lossy(&log).contains("states_offset"),
                 "{environment}"
             );
             log.contains(&b'\x1b')

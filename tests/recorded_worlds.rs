@@ -310,7 +310,7 @@ train STATES --out x --burn-in 3 => burn_in: expected to be left out, as the sta
     let table =
         "STATES --model wildfire => model: expected to be left out, as the states file decides it
 STATES --states-offset 5 => states_offset: expected 0 to 4
---states-offset 3 => expected false and 0 without a states file
+--states-offset 3 => states_offset: expected 0 without a states file
 --states no/such.npz => states file no/such.npz: No such file";
     check_table(SERVER, &table.replace("STATES", &states));
 }

@@ -5,3 +5,4 @@ mod link;
 pub mod mission;
 mod pilot;
 pub mod run;
+pub mod team;

@@ -3,5 +3,4 @@
 pub(crate) mod arena;
 pub(crate) mod compare;
 pub mod report;
-pub(crate) mod team;
 mod world_run;

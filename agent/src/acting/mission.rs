@@ -1,6 +1,6 @@
 //! The mission of an agent on one world of a running server, and checks that the server fits it.
 
-use crate::benchmark::team::Team;
+use crate::acting::team::Team;
 use crate::client::info::connect;
 use anyhow::{Result, bail, ensure};
 use emberwatch_learning::config::AgentConfig;

@@ -3,7 +3,7 @@
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
 use crate::acting::link::Link;
 use crate::acting::mission::{Mission, info_of, model_of, needs_model, recorded_states};
-use crate::benchmark::team::Team;
+use crate::acting::team::Team;
 use crate::client::errors::is_late;
 use crate::client::info::{connect, is_belief_left};
 use crate::client::view::view;

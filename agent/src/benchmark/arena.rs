@@ -1,7 +1,7 @@
 //! The worlds on which policies are compared, the same for all policies.
 
 use crate::acting::mission::{check_recorded, needs_model, recorded_states};
-use crate::benchmark::team::Team;
+use crate::acting::team::Team;
 use crate::client::worlds::Worlds;
 use anyhow::{Context, Result, ensure};
 use emberwatch_learning::policy::Policy;

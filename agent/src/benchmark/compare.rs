@@ -1,9 +1,9 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
+use crate::acting::team::Team;
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::PolicyRun;
 use crate::benchmark::report::common_worlds::World;
-use crate::benchmark::team::Team;
 use crate::benchmark::world_run::WorldRun;
 use crate::client::view::view;
 use anyhow::{Context, Result, ensure};

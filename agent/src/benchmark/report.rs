@@ -20,5 +20,5 @@ mod teams;
 pub mod training;
 
 pub use self::figures::{draw_ladder, draw_rewards, draw_teams, save};
-pub use self::policy_run::{ALONE, PolicyRun, groups};
+pub use self::policy_run::{PolicyRun, groups};
 pub use self::table::render_table;

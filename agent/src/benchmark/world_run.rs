@@ -1,7 +1,7 @@
 //! Measures one world's run: scores the flights and beliefs of each step, and sums them up in a row of the results.
 
+use crate::acting::team::Team;
 use crate::benchmark::report::PolicyRun;
-use crate::benchmark::team::Team;
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::{Found, MeritTally};

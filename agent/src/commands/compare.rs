@@ -2,6 +2,7 @@
 
 use super::shared::{asks_for_help, check_csv, make_folder, write};
 use super::worlds::{Source, WorldFlags};
+use crate::acting::team::Team;
 use crate::benchmark::arena::Arena;
 use crate::benchmark::compare::{Comparison, Results, compare};
 use crate::benchmark::report::common_worlds::check_worlds;
@@ -10,7 +11,6 @@ use crate::benchmark::report::{
     PolicyRun, draw_ladder, draw_rewards, draw_teams, figures::FIRE_CELLS_PER_STEP, groups,
     render_table,
 };
-use crate::benchmark::team::Team;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;

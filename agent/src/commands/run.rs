@@ -3,7 +3,7 @@
 use super::shared::{parse_range, parse_seconds};
 use crate::acting::mission::Mission;
 use crate::acting::run::run;
-use crate::benchmark::team::Team;
+use crate::acting::team::Team;
 use crate::client::info::wait_for_server;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};

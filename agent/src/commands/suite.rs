@@ -5,13 +5,13 @@
 use super::compare::run_comparison;
 use super::shared::{asks_for_help, make_folder, write};
 use super::trainings::{Trained, Trainings};
+use crate::acting::team::Team;
 use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
 use crate::benchmark::report::common_worlds::{World, check_worlds};
 use crate::benchmark::report::runs_file::{csv_files, file_of, read_tasks, write_runs};
 use crate::benchmark::report::suite::{CEILING, FLOOR, render_suite};
 use crate::benchmark::report::{PolicyRun, groups};
-use crate::benchmark::team::Team;
 use crate::client::worlds::Worlds;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};

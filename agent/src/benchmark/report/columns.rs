@@ -1,7 +1,8 @@
 //! Markdown tables of comparisons, suites and the leaderboard.
 
+use crate::acting::team::ALONE;
 use crate::benchmark::report::number::{NOTHING, number, signed, with_error};
-use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
+use crate::benchmark::report::policy_run::{Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 

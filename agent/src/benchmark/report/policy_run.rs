@@ -1,11 +1,9 @@
 //! The results of a comparison, and their groups.
 
+use crate::acting::team::ALONE;
 use crate::benchmark::report::statistics::Estimate;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
-/// Label of a team whose robots ignore each other, and of a single robot.
-pub const ALONE: &str = "alone";
 
 /// The results of one policy on one world: a row of the CSV file of `emberwatch-agent compare`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

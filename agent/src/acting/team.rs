@@ -1,7 +1,9 @@
 //! How the robots of a world act together.
 
-use crate::benchmark::report::ALONE;
 use clap::ValueEnum;
+
+/// Label of a team whose robots ignore each other, and of a single robot.
+pub const ALONE: &str = "alone";
 
 /// How the robots of a world act together. With one robot, all kinds but [`Self::Oracle`] are the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
