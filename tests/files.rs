@@ -31,7 +31,7 @@ fn wrong_files_are_refused_by_path_and_entry() {
         (
             "--config",
             "worlds = 'three'\n",
-            "PATH | invalid type | worlds",
+            "PATH | worlds: expected 1 to 1024, got three",
         ),
         ("--config", "worlds = = 3\n", "PATH | config file"),
         ("--model", "", "PATH | missing field"),

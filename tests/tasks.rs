@@ -141,14 +141,14 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
 --task small --sensor-radius 1 => sensor_radius: expected to be left out, as the task decides it
 --task jacksboro --states-offset 3 => states_offset: expected to be left out, as the task decides it
 --task= => task : expected a name or a file, got \"\"
---task FILE => missing field `moves`
+--task FILE => missing field `test_seeds`
 --task OTHER => name: expected a name that no built-in task has, got small
 --task PIPE => expected a regular file, got a pipe";
     let table = table.replace("FILE", &file).replace("OTHER", &other);
     check_table(SERVER, &table.replace("PIPE", &pipe));
     let table =
         "compare --task small --height 3 => height: expected to be left out, as the task decides it, got 3
-compare --task small --robots 2 => --robots | cannot be used with | --task
+compare --task small --robots 2 => robots: expected to be left out, as the task decides it
 train --task small --moves 3 --out x => moves: expected to be left out, as the task decides it, got 3
 compare --task ash => task ash: No such file | expected a file, or one of wildfire, small
 compare --task PIPE => expected a regular file, got a pipe
