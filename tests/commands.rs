@@ -55,7 +55,7 @@ run --instance nobody --policy known/beam/ash --model wildfire => "known/beam/as
 compare --seeds 8..0 => --seeds | FIRST below END
 compare --seeds 3 => --seeds | FIRST..END
 compare --steps 0 => --steps | 1..=10000000
-compare --robots 1,65 => --robots | 1..=64
+compare --robots 1,65 => --robots | expected 1 to 64
 compare --team apart => --team | alone, shared, joint, oracle
 compare --policies coverage,coverage => each name once | got "coverage" twice
 compare --baseline ash => --baseline | expected one of | got "ash"
