@@ -330,26 +330,4 @@ mod tests {
         }
         assert_eq!((episode.outcome().hovered, episode.outcome().late), (1, 8));
     }
-
-    #[test]
-    fn a_reset_repeats_the_episode_of_its_seed_until_max_steps() {
-        let rules = rules(3, Start::Random);
-        let mut episode = Episode::new(&rules, 9);
-        let first = episode.robots()[0].cell();
-        for (number, seed) in (1..).zip([9, 10, 9]) {
-            for k in 1..=3 {
-                assert!(!episode.is_over());
-                step(&mut episode, &rules, &[1, 1, 1], 0);
-                assert_eq!(episode.outcome().step, k);
-                assert!(!episode.outcome().is_terminated);
-            }
-            assert!(episode.is_over());
-            episode.reset(&rules, seed);
-            assert_eq!(episode.states(), Episode::new(&rules, seed).states());
-            let n_seen = episode.robots()[0].frame().observed().count();
-            assert_eq!((episode.outcome().step, n_seen), (0, 0));
-            assert_eq!(episode.outcome().episode, number);
-        }
-        assert_eq!(episode.robots()[0].cell(), first);
-    }
 }
