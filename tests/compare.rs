@@ -118,20 +118,6 @@ fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
 }
 
 #[test]
-fn runs_with_one_seed_act_alike() {
-    let act = || {
-        let server = Server::start(WORLDS);
-        let flags = "--policy shooting --steps 20 --shooting-samples 32";
-        Program::agent(&server.instance, flags).ends(0);
-        assert_eq!(server.holder(), None);
-        server.observe(0)
-    };
-    let first = act();
-    assert_eq!(first.0.step, 20);
-    assert_eq!(act(), first);
-}
-
-#[test]
 fn a_second_model_runs_from_end_to_end() {
     let model = repository().join("config/models/road-ice.toml");
     let model = format!("--model {}", model.display());

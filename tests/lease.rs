@@ -5,7 +5,7 @@ use emberwatch_protocol::client::Claim;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::{Reply, Request};
 use emberwatch_protocol::message::Status;
-use emberwatch_protocol::{Client, Connection, Move};
+use emberwatch_protocol::{Client, Connection};
 use std::time::Duration;
 use tests::harness::{PATIENCE, Paths, SMALL, Server, fly, seed};
 use tests::wire::{RawClient, Wire};
@@ -93,22 +93,4 @@ fn a_seventeenth_client_is_told_the_limit_and_others_go_on() {
     fly(&mut holder, Paths::new(0).next(6));
     drop(others);
     server.connect();
-}
-
-#[test]
-fn paths_of_other_lengths_are_refused_though_their_sum_is_right() {
-    let server = Server::start(&format!("{SMALL} --worlds 3"));
-    let mut client = server.acquire(0..3);
-    for (lengths, status, detail) in [
-        (&[6, 5, 7][..], Status::WrongPathLength, 6),
-        (&[6, 6], Status::WrongLength, 42),
-    ] {
-        let paths = lengths.iter().map(|&length| vec![Move::Up; length]);
-        check(
-            client.step(0..3, &paths.collect::<Vec<_>>()),
-            status,
-            detail,
-        );
-    }
-    assert_eq!(server.step_of(0), 0);
 }

@@ -3,7 +3,6 @@
 //! [`TARGETS`] lists all targets. `tests/decoders.rs` runs each target on damaged copies of its corpus,
 //! `fuzz/corpus/<name>/`. `fuzz/` runs the same functions under libFuzzer.
 
-mod besieged;
 mod files;
 mod messages;
 mod requests;

@@ -2,7 +2,6 @@
 
 #![allow(missing_docs, reason = "tests, which share it")]
 
-pub mod attacker;
 pub mod fuzz;
 pub mod harness;
 pub mod meter;

@@ -77,7 +77,7 @@ impl Mirror {
 }
 
 /// Repeats a step, given its result and the robots' paths. The paths of robots that hovered or were late are empty.
-pub fn step_again(
+fn step_again(
     episode: &mut Episode,
     rules: &Rules,
     told: &WorldResult,

@@ -269,25 +269,6 @@ mod tests {
     }
 
     #[test]
-    fn figures_without_hidden_states_are_still_measured() {
-        let shape = Shape::new(1, 4).expect("test shape");
-        let mut tally = MeritTally::new(shape, FIRE, 1);
-        let found = Found {
-            n_hits: 1,
-            n_burning: 7,
-        };
-        tally.update(&[flight(&[0, 1])], found, None);
-        let expected = Merit {
-            steps_to_detection: Some(1),
-            burning_cells_at_detection: Some(7),
-            burning_seen_share: None,
-            front_distance: None,
-            grid_seen_share: 0.5,
-        };
-        assert_eq!(tally.merit(), expected);
-    }
-
-    #[test]
     fn nearest_agrees_with_a_full_scan() {
         let shape = Shape::new(5, 7).expect("test shape");
         for seed in 0..100 {

@@ -22,7 +22,7 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_belief::planning::{Integration, Objective, Target};
 use emberwatch_model::grid::{Cell, Shape};
-use emberwatch_model::path::{Move, fly};
+use emberwatch_model::path::Move;
 use emberwatch_model::{Frame, Model};
 use golden_file::{Golden, frame_from};
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, Axis};
@@ -214,27 +214,5 @@ fn path_scores_and_winners_agree() {
             let best = ours.iter().copied().fold(f32::MIN, f32::max);
             assert!(best - ours[winner] < TOLERANCE, "{what}");
         }
-    }
-}
-
-/// The reference's random walk clamps each move. The first coordinate of its positions is the row, unlike in the
-/// reference's planner.
-#[test]
-fn random_walks_fly_the_same_cells() {
-    let mut golden = Golden::open("a5_planner");
-    let basis = [Move::Right, Move::Up, Move::Down, Move::Left]; // (0,1), (-1,0), (1,0), (0,-1)
-    for name in ["rw_6x6", "rw_6x6b", "rw_64x64"] {
-        let mask: Array2<u8> = golden.get(&format!("{name}_mask"));
-        let moves: Array1<u8> = golden.get(&format!("{name}_moves"));
-        let start: Array1<i64> = golden.get(&format!("{name}_start"));
-        let end: Array1<f64> = golden.get(&format!("{name}_end"));
-        let (row, col) = (start[0] as usize, start[1] as usize);
-        let path: Vec<Move> = moves.iter().map(|&m| basis[usize::from(m)]).collect();
-        let flight = fly(shape_of(mask.dim()), Cell { row, col }, &path);
-        for (cell, &seen) in mask.iter().enumerate() {
-            assert_eq!(flight.visited.contains(&cell), seen > 0, "{name} {cell}");
-        }
-        let ends = [flight.end.row as f64, flight.end.col as f64];
-        assert_eq!(ends, [end[0], end[1]], "{name}");
     }
 }

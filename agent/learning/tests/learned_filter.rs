@@ -148,13 +148,6 @@ fn training_lowers_the_loss() {
 }
 
 #[test]
-fn training_waits_for_a_block_for_each_stream() {
-    let mut replay = replay(16); // 4 blocks
-    let update = optimiser(0).update(&mut replay, None);
-    assert_eq!(update.expect("finite"), None);
-}
-
-#[test]
 fn a_non_finite_parameter_stops_training_with_an_error() {
     let mut parameters = Parameters::first(dimensions(), 0);
     parameters.tensors[1][4] = f32::NAN;

@@ -223,26 +223,3 @@ impl TryFrom<u32> for Operation {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn status_codes_survive_the_wire() {
-        for status in Status::ALL {
-            assert_eq!(Status::try_from(status as u32), Ok(status));
-            for detail in [0, 1, u64::MAX] {
-                assert!(!status.explain(detail).is_empty());
-            }
-        }
-        for value in [15, 16, 24] {
-            let what = "status";
-            assert_eq!(Status::try_from(value), Err(UnknownCode { what, value }));
-        }
-        for value in [0, 4, u32::MAX] {
-            let what = "operation";
-            assert_eq!(Operation::try_from(value), Err(UnknownCode { what, value }));
-        }
-    }
-}

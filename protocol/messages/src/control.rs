@@ -313,21 +313,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn requests_are_parsed_as_protocol_md_shows_them() {
-        let read = |text: &str| serde_json::from_str::<Request>(text).ok();
-        let text = r#"{"op":"acquire","first_robot":0,"n_robots":4}"#;
-        let expected = Request::Acquire {
-            first_robot: 0,
-            n_robots: 4,
-            takeover: false,
-            ttl_millis: None,
-        };
-        assert_eq!(read(text), Some(expected));
-        assert_eq!(read(r#"{"op":"status"}"#), Some(Request::Status {}));
-        assert_eq!(read(r#"{"op":"renew","lease":1,"extra":2}"#), None);
-    }
-
-    #[test]
     fn coverage_follows_the_server_s_rule() {
         for (rule, asks, given) in [
             (CoverageRule::Path, false, Ok(Coverage::Path)),

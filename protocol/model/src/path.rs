@@ -136,16 +136,3 @@ pub(super) fn fly_by(
     visited.truncate(n_visited);
     cell
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_wrong_byte_is_named_with_its_position() {
-        let wrong = MoveError { index: 2, value: 4 };
-        assert_eq!(path_from_bytes(&[0, 1, 4]), Err(wrong));
-        let path = path_from_bytes(&[3, 0]).expect("a path");
-        assert_eq!(path, [Move::Right, Move::Up]);
-    }
-}

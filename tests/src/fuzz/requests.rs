@@ -1,18 +1,49 @@
 //! Fuzz targets for the requests that the server reads.
+//!
+//! Successive inputs go to the same simulator, so that leases, resets and episodes reach every state. After some inputs
+//! a new simulator replaces it, so that a failure can be reproduced from few inputs.
 
-use super::besieged::{
-    ATTACKERS, N_MOVES, N_ROBOTS, N_THEIRS, N_WORLDS, SHARED, Siege, WorldSeen, check_answer,
-    on_siege, step_request,
-};
 use super::messages::{Seed, split_header, survives};
-use crate::wire::step_body;
+use crate::wire::{step_body, step_header};
 use bytemuck::bytes_of;
-use emberwatch_protocol::control::{Reply, Request, parse};
+use emberwatch_protocol::control::{CoverageRule, Reply, Request, WorldStatus, parse};
 use emberwatch_protocol::message::{
-    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepRequest, VERSION,
+    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepReply, StepRequest,
+    VERSION, WorldResult,
 };
-use emberwatch_sim::simulator::{Outcome, PendingReply, Stepped};
-use std::time::Duration;
+use emberwatch_protocol::payload::split_step_payload;
+use emberwatch_protocol::settings::WorldSettings;
+use emberwatch_sim::config::ServerConfig;
+use emberwatch_sim::results::{robot_result, world_result};
+use emberwatch_sim::simulator::{
+    ClientId, Outcome, PendingReply, ResetJob, ServerStats, Simulator, Stepped, Ticket,
+};
+use emberwatch_sim::world::{Episode, Robot};
+use rayon::ThreadPoolBuilder;
+use std::cell::RefCell;
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+const N_MOVES: usize = 4;
+const N_ROBOTS: u32 = 2;
+
+/// The worlds of the attackers come first. The last world is the victim's.
+const N_WORLDS: u32 = 3;
+const HOME: usize = 2;
+
+/// Number of robots that the attackers hold, from robot 0 on.
+const N_THEIRS: u32 = HOME as u32 * N_ROBOTS;
+
+/// Number of inputs after which the simulator is replaced.
+const N_INPUTS: usize = 256;
+
+/// Number of inputs from one step of the victim to the next.
+const VICTIM_STEPS: usize = 8;
+
+const VICTIM: ClientId = ClientId { node: 1, pid: 1 };
+
+/// The attacking clients. The first one holds the attackers' robots.
+const ATTACKERS: [ClientId; 2] = [ClientId { node: 2, pid: 2 }, ClientId { node: 3, pid: 3 }];
 
 /// The placeholder for the attacker's lease in a control request.
 const LEASE: &str = "LEASE";
@@ -30,10 +61,151 @@ pub fn control(bytes: &[u8]) -> bool {
         .is_some_and(|(&before, text)| on_siege(|siege| siege.control(before, text)))
 }
 
+/// A simulator under attack, with the simulated clock and the requests that wait.
+struct Siege {
+    simulator: Simulator,
+    now: Instant,
+    jobs: Vec<ResetJob>,
+    pending: Vec<(ClientId, PendingReply)>,
+    /// The leases of the victim and of the attackers, the latest ones.
+    leases: [u64; 3],
+    attackers_step: Option<Ticket>,
+    n_inputs: usize,
+}
+
+/// The result of a world, and the result and frame of each of its robots.
+type WorldSeen = (WorldResult, Vec<(RobotResult, Vec<u8>)>);
+
+/// Gives one input to the simulator, which must not change the victim's world. Now and then the victim steps its world.
+fn on_siege(input: impl FnOnce(&mut Siege) -> bool) -> bool {
+    thread_local! { static SIEGE: RefCell<Option<Siege>> = const { RefCell::new(None) } }
+    SIEGE.with_borrow_mut(|kept| {
+        kept.take_if(|siege| siege.n_inputs == N_INPUTS);
+        let siege = kept.get_or_insert_with(Siege::begin);
+        let before = siege.worlds().swap_remove(HOME);
+        let is_accepted = input(siege);
+        siege.receive_answers();
+        let after = siege.worlds().swap_remove(HOME);
+        assert!(before == after, "the victim's world changed");
+        siege.n_inputs += 1;
+        if siege.n_inputs % VICTIM_STEPS == 0 {
+            siege.victim_steps();
+        }
+        is_accepted
+    })
+}
+
 impl Siege {
+    /// Creates the simulator, in which the victim and the first attacker hold their robots.
+    fn begin() -> Self {
+        let config = ServerConfig {
+            worlds: N_WORLDS,
+            deadline_millis: 50,
+            coverage: CoverageRule::Client,
+            world: WorldSettings {
+                robots: N_ROBOTS,
+                height: 2,
+                width: 3,
+                moves: N_MOVES,
+                burn_in: 0,
+                max_steps: 40,
+                ..WorldSettings::default()
+            },
+            ..ServerConfig::default()
+        };
+        let threads = ThreadPoolBuilder::new().num_threads(1).build();
+        let mut tokens = 11..;
+        let next_token = Box::new(move || tokens.next().expect("numbers"));
+        let checked = config.check().expect("valid settings");
+        let simulator = Simulator::new(checked, threads.expect("a thread"), next_token);
+        let (simulator, jobs) = simulator.expect("valid settings");
+        let mut siege = Self {
+            simulator,
+            now: Instant::now(),
+            jobs,
+            pending: Vec::new(),
+            leases: [0; 3],
+            attackers_step: None,
+            n_inputs: 0,
+        };
+        siege.finish_resets();
+        for (who, client, robots) in [
+            (0, VICTIM, N_THEIRS..N_THEIRS + N_ROBOTS),
+            (1, ATTACKERS[0], 0..N_THEIRS),
+        ] {
+            let (first_robot, n_robots) = (robots.start, robots.len());
+            let robots = format!(r#""first_robot":{first_robot},"n_robots":{n_robots}"#);
+            let text = format!(r#"{{"op":"acquire",{robots},"ttl_millis":86400000}}"#);
+            let Outcome::Pending(_, pending) = siege.ask(client, VERSION, text.as_bytes()) else {
+                panic!("the robots are free");
+            };
+            siege.answer(who, &pending);
+        }
+        siege
+    }
+
+    fn ask(&mut self, client: ClientId, version: u32, text: &[u8]) -> Outcome {
+        self.simulator
+            .control(self.now, client, version, text, &ServerStats::default())
+    }
+
+    /// Runs the pending resets and answers the clients that waited for them.
+    fn finish_resets(&mut self) {
+        for job in std::mem::take(&mut self.jobs) {
+            let (world, episode) = job.run(&self.simulator.spec().rules);
+            self.simulator.put(world, episode);
+        }
+        for (client, pending) in std::mem::take(&mut self.pending) {
+            self.answer(usize::from(client == ATTACKERS[1]) + 1, &pending);
+        }
+    }
+
+    fn answer(&mut self, who: usize, pending: &PendingReply) {
+        let reply = self.simulator.pending_reply(self.now, pending);
+        if let Reply::Lease(lease) = reply.expect("all worlds are ready") {
+            self.leases[who] = lease.lease;
+        }
+    }
+
+    /// Returns the results and frames of all worlds, or `None` for a world in its burn-in.
+    fn worlds(&self) -> Vec<Option<WorldSeen>> {
+        let worlds = self.simulator.worlds();
+        let episodes = worlds.map(|world| self.simulator.episode(world));
+        episodes.map(|episode| episode.map(seen)).collect()
+    }
+
+    /// Returns the public status of the worlds.
+    fn status(&mut self) -> Vec<WorldStatus> {
+        match self.ask(VICTIM, VERSION, br#"{"op":"status"}"#) {
+            Outcome::Answer(Reply::Status(status)) => status.worlds,
+            _ => panic!("everybody may ask for the status"),
+        }
+    }
+
+    /// Steps the victim's world.
+    fn victim_steps(&mut self) {
+        let k = (self.n_inputs / VICTIM_STEPS - 1) as u64;
+        let request = step_request(self.leases[0], N_THEIRS..N_THEIRS + N_ROBOTS);
+        let body = step_body(&[k], &[(k % 4) as u8; N_MOVES * N_ROBOTS as usize]);
+        let (simulator, mut payload) = (&mut self.simulator, Vec::new());
+        match simulator.step(self.now, VICTIM, &request, &body, &mut payload) {
+            Stepped::Reply(reply) => assert_eq!(check_answer(&reply, &payload), Status::Ok),
+            Stepped::Waits(_) => panic!("the victim holds all robots of its world"),
+        }
+    }
+
+    /// Receives the answers to step requests that waited.
+    fn receive_answers(&mut self) {
+        let mut payload = Vec::new();
+        while let Some((ticket, reply)) = self.simulator.next_answer(&mut payload) {
+            check_answer(&reply, &payload);
+            assert_eq!(self.attackers_step.take(), Some(ticket));
+        }
+    }
+
     fn step(&mut self, request: &StepRequest, body: &[u8]) -> bool {
         // The attacker has one request at a time, so a new one cancels its waiting request.
-        if let Some((given_up, _)) = self.attackers_step.take() {
+        if let Some(given_up) = self.attackers_step.take() {
             self.simulator.cancel_step(self.now, given_up);
         }
         let body = self.body_from_present(request, body);
@@ -46,7 +218,7 @@ impl Siege {
             Stepped::Reply(reply) => reply,
             Stepped::Waits(ticket) => {
                 assert!(before == after, "a step that waits changed a world");
-                self.attackers_step = Some((ticket, self.now));
+                self.attackers_step = Some(ticket);
                 return true;
             }
         };
@@ -104,14 +276,6 @@ impl Siege {
         if is_set(1) {
             self.finish_resets();
         }
-        if is_set(5) {
-            self.fly_shared();
-        }
-        if is_set(6) {
-            let request = step_request(self.leases[1], N_THEIRS - 1..N_THEIRS);
-            self.step(&request, &step_body(&[0], &[before % 4; N_MOVES]));
-            self.check_shared();
-        }
         if is_set(2) {
             self.now += Duration::from_millis(60);
         }
@@ -154,7 +318,7 @@ impl Siege {
                 !is_refused
             }
             Outcome::Changed(worlds, reply) => {
-                assert!(worlds.end <= SHARED, "a fork into a world of the victim's");
+                assert!(worlds.end <= HOME, "a fork into the victim's world");
                 assert_eq!(reply.status(), Status::Ok);
                 true
             }
@@ -182,6 +346,33 @@ impl Siege {
     }
 }
 
+fn seen(episode: &Episode) -> WorldSeen {
+    let seen = |robot: &Robot| {
+        let frame = robot.frame().as_bytes().to_vec();
+        (robot_result(robot.outcome()), frame)
+    };
+    let robots = episode.robots().iter().map(seen);
+    (world_result(episode.outcome()), robots.collect())
+}
+
+/// Checks that an answer is complete and that a refusal is empty.
+fn check_answer(reply: &StepReply, payload: &[u8]) -> Status {
+    assert_eq!(reply.version, VERSION);
+    let parts = split_step_payload(reply, payload).expect("as long as its header says");
+    let status = Status::try_from(reply.status).expect("a known status");
+    assert_eq!(parts.worlds.is_empty(), status != Status::Ok, "{status:?}");
+    status
+}
+
+fn step_request(lease: u64, robots: Range<u32>) -> StepRequest {
+    StepRequest {
+        sequence: 7,
+        first_robot: robots.start,
+        n_robots: robots.len() as u32,
+        ..step_header(lease, N_MOVES as u32)
+    }
+}
+
 /// Replaces the placeholder in a text with the lease.
 fn replaced(text: &[u8], lease: &str) -> Vec<u8> {
     let mut words = text.windows(LEASE.len());
@@ -192,9 +383,9 @@ fn replaced(text: &[u8], lease: &str) -> Vec<u8> {
 }
 
 pub fn step_seeds() -> Vec<Seed> {
-    // The attacker's lease is the third one granted.
-    let one = step_request(13, 0..2);
-    let both = step_request(13, 0..4);
+    // The attacker's lease is the second one granted.
+    let one = step_request(12, 0..2);
+    let both = step_request(12, 0..4);
     let full = StepRequest {
         flags: FLAG_FULL_COVERAGE | FLAG_TEAM_FRAMES,
         ..one
@@ -202,15 +393,14 @@ pub fn step_seeds() -> Vec<Seed> {
     let observe = StepRequest {
         operation: Operation::Observe as u32,
         n_moves: 0,
-        ..step_request(0, 0..N_WORLDS * N_ROBOTS as u32)
+        ..step_request(0, 0..N_WORLDS * N_ROBOTS)
     };
     let recall = StepRequest {
         operation: Operation::Recall as u32,
         n_robots: 2,
         ..observe
     };
-    let shared = step_request(13, 4..5);
-    let victims = step_request(11, 6..8);
+    let victims = step_request(11, 4..6);
     let with = |request: &StepRequest, body: &[u8]| [bytes_of(request), body].concat();
     let paths = [0, 1, 2, 3, 1, 1, 3, 3];
     let of_both = step_body(&[0, 0], &[paths, paths].concat());
@@ -220,7 +410,6 @@ pub fn step_seeds() -> Vec<Seed> {
         ("full_team_frame", with(&full, &step_body(&[0], &paths))),
         ("observe", with(&observe, &[])),
         ("recall", with(&recall, &step_body(&[0], &[]))),
-        ("shared", with(&shared, &step_body(&[0], &[3; N_MOVES]))),
         ("stolen_lease", with(&victims, &step_body(&[0], &paths))),
     ]
 }

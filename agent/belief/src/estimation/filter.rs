@@ -223,20 +223,6 @@ mod tests {
     }
 
     #[test]
-    fn correct_leaves_unseen_cells_unchanged() {
-        let shape = Shape::new(1, 3).expect("test shape");
-        let mut filter = BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape), false)
-            .expect("valid");
-        filter
-            .correct(&frame(shape, &[255, 2, 255]))
-            .expect("possible");
-        let fire = filter.belief().probability(2);
-        assert_eq!([fire[[0, 0]], fire[[0, 2]]], [1.0 / 3.0; 2]);
-        // The column of O for an observed fire is (.01, .05, .98), and the prior is uniform.
-        assert!((fire[[0, 1]] - 0.98 / 1.04).abs() < 1e-6);
-    }
-
-    #[test]
     fn a_tiny_probability_does_not_count_as_zero() {
         let shape = Shape::new(1, 1).expect("test shape");
         let numbers = [1.0, 0.0, f32::MIN_POSITIVE];

@@ -295,24 +295,6 @@ fn neural(
 }
 
 #[test]
-fn a_learned_filter_resumes_bit_for_bit() {
-    let (dimensions, mut config) = (dimensions(), config(BasisKind::Estimate));
-    let learning = &mut config.learning;
-    (learning.window, learning.block_windows, learning.streams) = (2, 1, 2);
-    let mut learner = FilterLearner::new(dimensions, worlds(), &config);
-    learner.attach(vec![observation(0)]).expect("possible");
-    let left = learn(&mut learner, 1..12);
-    let n_updates = learner.n_updates();
-    assert!(n_updates > 0);
-    let resumed = FilterLearner::resume(&left, dimensions, worlds(), &config);
-    let mut resumed = resumed.expect("its own");
-    let n_resumed = resumed.attach(vec![observation(11)]).expect("possible");
-    assert_eq!(n_resumed, 1);
-    let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 12..16));
-    assert!(contents[0] == contents[1] && learner.n_updates() > n_updates);
-}
-
-#[test]
 fn a_neural_belief_resumes_bit_for_bit() {
     let filter = learned_filter();
     for filter in [None, Some(&filter)] {

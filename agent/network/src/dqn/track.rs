@@ -92,20 +92,6 @@ mod tests {
     }
 
     #[test]
-    fn steps_combine_into_one_discounted_transition() {
-        let mut track = Track::new(1);
-        assert_eq!(track.add(step(3)), Some(step(3)));
-        assert_eq!(track.end(), []);
-        let mut track = Track::new(3);
-        assert_eq!([2, 3].map(|at| track.add(step(at))), [None, None]);
-        for first in 2..6 {
-            let [a, b, c] = [0, 1, 2].map(|later| f32::from(first + later));
-            let expected = over(first, a + 0.5 * b + 0.25 * c, 3, 0.125);
-            assert_eq!(track.add(step(first + 2)), Some(expected));
-        }
-    }
-
-    #[test]
     fn a_short_episode_has_one_transition_per_step() {
         // The returns are 4 + 5 / 2 + 6 / 4, 5 + 6 / 2 and 6. All end at the last state, 7.
         let last = [
@@ -124,18 +110,6 @@ mod tests {
         assert_eq!((full.len(), &full[2]), (3, &last[0]));
         assert_eq!(track.end(), last[1..]);
         assert_eq!((track.end(), track), (vec![], Track::new(3)));
-    }
-
-    #[test]
-    fn a_terminated_episode_has_no_value_after_its_end() {
-        let mut track = Track::new(2);
-        let last = Transition {
-            discount: 0.0,
-            ..step(5)
-        };
-        track.add(step(4));
-        assert_eq!(track.add(last.clone()), Some(over(4, 6.5, 2, 0.0)));
-        assert_eq!(track.end(), [last]);
     }
 
     #[test]

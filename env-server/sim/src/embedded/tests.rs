@@ -89,11 +89,14 @@ fn a_restored_snapshot_continues_in_the_same_way() {
 
 #[test]
 fn requests_are_refused_as_a_server_refuses_them() {
-    let mut client = client(1, 20);
+    let mut client = client(2, 20);
     let lease = client.lease();
     assert_eq!(status(client.reset(&reset(3, 1))), Status::NoSuchWorld);
-    let short = client.step(0..1, &[vec![Move::Up; 3]]);
-    assert_eq!(status(short), Status::WrongPathLength);
+    // The sum of the lengths is right.
+    let uneven = client.step(0..2, &[3, 5].map(|length| vec![Move::Up; length]));
+    assert_eq!(status(uneven), Status::WrongPathLength);
+    let few = client.step(0..2, &[vec![Move::Up; 4]]);
+    assert_eq!(status(few), Status::WrongLength);
     let release = Request::Release { lease };
     client.backend().control(&release, LONG).expect("a lease");
     assert_eq!(status(step(&mut client)), Status::LeaseLost);

@@ -289,23 +289,6 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_shows_the_visited_cells_and_no_others() {
-        let rules = rules(0, Start::Corner);
-        let mut episodes = [Episode::new(&rules, 1), Episode::new(&rules, 1)];
-        step(&mut episodes[0], &rules, &[1, 3, 3], 0);
-        step(&mut episodes[1], &rules, &[0, 0, 0], 1);
-        let [masked, full] = episodes.each_ref().map(|it| it.robots()[0].frame());
-        let cells: Vec<usize> = masked.observed().map(|(cell, _)| cell).collect();
-        assert_eq!(cells, [20, 21, 22]);
-        assert_eq!(full.observed().count(), 240);
-        // Neither the path nor full coverage changes the readings of these cells or the states.
-        for (cell, value) in masked.observed() {
-            assert_eq!(full.as_bytes()[cell], value);
-        }
-        assert_eq!(episodes[0].states(), episodes[1].states());
-    }
-
-    #[test]
     fn robots_that_stay_see_nothing_and_do_not_move() {
         let mut rules = rules(0, Start::Corner);
         rules.n_robots = 4;
@@ -329,27 +312,5 @@ mod tests {
             assert_eq!(robot.outcome().n_moves as usize, expected);
         }
         assert_eq!((episode.outcome().hovered, episode.outcome().late), (1, 8));
-    }
-
-    #[test]
-    fn a_reset_repeats_the_episode_of_its_seed_until_max_steps() {
-        let rules = rules(3, Start::Random);
-        let mut episode = Episode::new(&rules, 9);
-        let first = episode.robots()[0].cell();
-        for (number, seed) in (1..).zip([9, 10, 9]) {
-            for k in 1..=3 {
-                assert!(!episode.is_over());
-                step(&mut episode, &rules, &[1, 1, 1], 0);
-                assert_eq!(episode.outcome().step, k);
-                assert!(!episode.outcome().is_terminated);
-            }
-            assert!(episode.is_over());
-            episode.reset(&rules, seed);
-            assert_eq!(episode.states(), Episode::new(&rules, seed).states());
-            let n_seen = episode.robots()[0].frame().observed().count();
-            assert_eq!((episode.outcome().step, n_seen), (0, 0));
-            assert_eq!(episode.outcome().episode, number);
-        }
-        assert_eq!(episode.robots()[0].cell(), first);
     }
 }
