@@ -111,16 +111,6 @@ def test_a_panel_that_goes_is_pointed_at_no_more(programs, open_page):
     look.eventually(lambda: is_at_robot(look), "no panel is there")
 
 
-def test_keys_and_the_pointer_take_turns(resting):
-    _, look = resting
-    look.page.mouse.move(*middle(look, "panel-truth", 3, 4))
-    look.page.get_by_label("cells of seen so far").focus()
-    look.page.keyboard.press("ArrowDown")
-    look.eventually(lambda: is_at(look, "row 13, col 16"), "where the key went")
-    look.page.mouse.move(*middle(look, "panel-truth", 6, 7))
-    look.eventually(lambda: is_at(look, "row 6, col 7"), "where the pointer went then")
-
-
 def test_a_finger_points_while_it_touches(programs, open_page):
     server = programs.server(publish_truth=True)
     look = open_page(programs.dashboard(server.instance), **PHONE)

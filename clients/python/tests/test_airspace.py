@@ -32,7 +32,6 @@ from emberwatch.belief import known
 from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace
-from emberwatch.planning import beam_search
 
 SHAPE = (7, 5)
 ALL_MOVES = (
@@ -239,20 +238,6 @@ def test_the_filter_uses_maps(tmp_path: Path) -> None:
     assert simulated_prior(model, height=7, width=5, burn_in=20).shape == (3, 7, 5)
     with refuses("model: maps: expected a map of the 5 x 5 grid, got 7 x 5"):
         known(model, prior=np.full((3, 5, 5), 1 / 3))
-
-
-def test_beam_search_respects_the_airspace() -> None:
-    values, robots = np.random.default_rng(4).random((2, *SHAPE)), np.array([(2, 2), (0, 4)])
-    rng, airspace = np.random.default_rng(4), Airspace(no_fly=land.NO_FLY, radius=1)
-    paths = beam_search(values, robots, 5, rng=rng, width=4**5, airspace=airspace)
-
-    def worth(path: Any) -> float:
-        return sum(values[0][at] for at in set(land.cells_of((2, 2), path, land.NO_FLY)[1:]))
-
-    best = max(worth(every) for every in product(range(4), repeat=5))
-    assert worth(paths[0]) == pytest.approx(best, abs=1e-5)
-    # The other robot is enclosed.
-    assert land.cells_of((0, 4), paths[1], land.NO_FLY)[-1] == (0, 4)
 
 
 def test_an_invalid_airspace_is_refused() -> None:

@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 import pytest
 from environments import LIVELY, RECORDED, WILDFIRE, closed_later
-from failures import refuses
 
 import emberwatch
 from emberwatch.model import Model
@@ -56,18 +55,3 @@ def test_a_byte_order_mark_is_skipped(kind: str, tmp_path: Path) -> None:
         assert expected == got
     if isinstance(expected, Model):
         assert not got.toml.startswith("\ufeff")
-
-
-def test_other_encodings_are_refused_by_name(tmp_path: Path) -> None:
-    file = tmp_path / "wide.toml"
-    words = r"wide\.toml: expected text in UTF-8, got UTF-16 or UTF-32: save the file as UTF"
-    for read, text in READERS.values():
-        file.write_text(text, "utf-16")
-        with refuses(words):
-            read(file)
-    file = tmp_path / "latin.toml"
-    file.write_text(TASK, "latin-1")
-    with refuses("task .*latin.toml: expected text in UTF-8, got other bytes in line 9: save the"):
-        Task.named(file)
-    text = Path(LIVELY).read_text("utf-8")
-    assert Model.from_toml("\ufeff" + text) == Model.from_toml(text)

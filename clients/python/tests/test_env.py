@@ -142,14 +142,6 @@ def test_episodes_repeat_by_seed_and_differ_without_one() -> None:
         assert len({env.reset()[1]["truth"].tobytes() for env in envs for _ in range(2)}) == 4
 
 
-def test_an_episode_is_truncated_after_max_episode_steps() -> None:
-    env = make(max_episode_steps=3)
-    ends = [transition[3] for transition in rollout(env, 3, seed=1)[1:]]
-    assert ends == [False, False, True]
-    env.close()
-    assert gymnasium.spec(WILDFIRE).max_episode_steps == 1000
-
-
 @pytest.mark.parametrize(("name", "n_actions"), [(WILDFIRE, 1), (MOVES, 4)])
 def test_a_server_can_truncate_earlier(name: str, n_actions: int) -> None:
     with serving(max_steps=2) as instance:

@@ -377,30 +377,3 @@ def test_every_kind_accepts_models_in_any_form(name: str) -> None:
         kept.correct(np.zeros((height, width), np.uint8))
         kept.predict()
         assert np.allclose(kept.belief.sum(axis=0), 1, atol=1e-4), kind
-
-
-@pytest.mark.parametrize("kind", [*KNOWN, "neural"])
-def test_a_refused_frame_changes_nothing(kind: str, checkpoints: Path) -> None:
-    exact = re.sub(r"observed_as = \[[^]]*\]", "observed_as = @", MODEL.toml)
-    for state in ("[1.0, 0.0, 0.0]", "[0.0, 1.0, 0.0]", "[0.0, 0.0, 1.0]"):
-        exact = exact.replace("@", state, 1)
-    model, prior = Model.from_toml(exact), np.full((3, *GRID.values()), 1 / 3, np.float32)
-    one, other = (
-        belief.load(checkpoints / "neural_belief", **GRID, n_worlds=2)
-        if kind == "neural"
-        else belief.known(model, prior=prior, kind=kind, n_worlds=2)
-        for _ in range(2)
-    )
-    frames = np.full(one.shape, 255, np.uint8)
-    frames[:, 2, 3] = 1
-    wrong = np.where(frames == 1, 2, frames).astype(np.uint8)
-    wrong[:, 0, :2] = 0
-    for _ in range(3):
-        one.correct(frames)
-        other.correct(frames)
-        with fails("impossible_frame", match="worlds 0, 1: frame"):
-            one.correct(wrong)
-        assert np.array_equal(one.belief, other.belief)
-        one.predict()
-        other.predict()
-        assert np.array_equal(one.belief, other.belief)

@@ -15,7 +15,6 @@ import oracle
 import pytest
 from environments import OBJECTIVE, assert_same, closed_later, rollout
 from failures import fails, refuses
-from gymnasium.utils.env_checker import check_env
 from processes import eventually, find, server
 
 import emberwatch
@@ -44,15 +43,6 @@ def interrupted(*_: object) -> None:
 def decide(env: Any) -> Any:
     """Steps with the first option. Returns k of one world or many."""
     return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
-
-
-@pytest.mark.parametrize("keywords", [{}, {"truth": True, "estimator": "known"}])
-def test_the_environment_checker_passes(keywords: dict[str, Any]) -> None:
-    env = make(render_mode="rgb_array", **keywords)
-    with environments.no_warnings():
-        check_env(env, skip_render_check=True)
-    picture = env.render()
-    assert picture.dtype == np.uint8 and picture.ndim == 3
 
 
 def test_actions_and_features_have_names(env: Any) -> None:

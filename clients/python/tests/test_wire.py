@@ -31,11 +31,6 @@ from emberwatch.client.replies import (
 from emberwatch.errors import EmberwatchError
 
 LAYOUTS = document.layouts()
-#: The results in payloads, as bytes, as an array and as a tuple.
-RESULTS = {
-    "WorldResult": (wire.WORLD, wire.WORLD_DTYPE, wire.WorldResult),
-    "RobotResult": (wire.ROBOT, wire.ROBOT_DTYPE, wire.RobotResult),
-}
 EXAMPLES = document.examples()
 HELLO, *HELLOS = (message for message in EXAMPLES if message.get("reply") == "hello")
 SIZES = {"height": 3, "width": 5, "n_moves": 4, "n_worlds": 1, "n_robots": 2}
@@ -83,17 +78,6 @@ class Wired:
 
 
 WIRED = Wired()
-
-
-def test_a_result_is_laid_out_as_documented() -> None:
-    kinds = {"u16": "<u2", "u32": "<u4", "u64": "<u8", "f64": "<f8"}
-    for name, (packed, dtype, kind) in RESULTS.items():
-        layout = LAYOUTS[name]
-        assert packed.format == layout.format
-        assert packed.size == dtype.itemsize == layout.size
-        fields = {field.name: (np.dtype(kinds[field.of]), field.offset) for field in layout.fields}
-        assert dict(dtype.fields) == fields
-        assert [*kind._fields] == list(fields)
 
 
 def test_every_status_has_an_error_with_name_code_and_detail() -> None:
