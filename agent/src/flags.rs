@@ -19,6 +19,7 @@ pub enum Preset {
 
 /// Flags for the agent's settings.
 #[derive(Debug, Args)]
+#[command(next_help_heading = "Settings of the agent")]
 pub struct AgentFlags {
     /// Start from these settings
     #[arg(long, default_value = "default")]

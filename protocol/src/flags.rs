@@ -1,7 +1,7 @@
 //! Settings as flags, from the table of their declarations: `states_offset` becomes `--states-offset`.
 
 use clap::{Arg, ArgGroup, ArgMatches, Args, Command, Error, FromArgMatches, Id};
-use emberwatch_model::settings::{Setting, Settings};
+use emberwatch_model::settings::{Setting, Settings, WorldSettings};
 use serde_json::{Map, Value};
 use std::marker::PhantomData;
 
@@ -63,9 +63,13 @@ fn flag(setting: Setting) -> Arg {
         "" => setting.name.to_uppercase(),
         words => words.into(),
     };
+    let mut of_worlds = WorldSettings::settings().into_iter();
+    let is_of_worlds = of_worlds.any(|it| it.name == setting.name);
+    let heading = if is_of_worlds { "Worlds" } else { "Server" };
     let flag = Arg::new(setting.name)
         .long(setting.name.replace('_', "-"))
         .help(setting.explanation())
+        .help_heading(heading)
         .value_name(placeholder)
         .allow_negative_numbers(true)
         .value_parser(move |text: &str| setting.parse(text));

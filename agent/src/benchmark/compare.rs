@@ -36,8 +36,6 @@ pub struct Comparison {
     pub teams: Vec<Team>,
     pub seeds: Range<u64>,
     pub steps: u64,
-    /// Steps for which a cell counts as seen after a visit, at least 1.
-    pub recent_steps: u32,
     pub config: AgentConfig,
     /// Learned models, for policies that use them.
     pub learned: Learned,
@@ -159,7 +157,7 @@ impl Comparison {
             rollouts.push(Rollout::begun(agent, seen)?);
         }
         let (target, n_robots) = (arena.model.target_state(), arena.n_robots());
-        let world = |&seed| WorldRun::new(seed, arena.shape(), target, self.recent_steps);
+        let world = |&seed| WorldRun::new(seed, arena.shape(), target);
         Ok(Players {
             rollouts,
             worlds: seeds.iter().map(world).collect(),

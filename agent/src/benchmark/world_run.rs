@@ -4,7 +4,7 @@ use crate::acting::team::Team;
 use crate::benchmark::report::PolicyRun;
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::scoring::Score;
-use emberwatch_belief::merit::{Found, MeritTally};
+use emberwatch_belief::merit::{Found, MeritTally, RECENT_STEPS};
 use emberwatch_belief::planning::Plan;
 use emberwatch_learning::beliefs::Input;
 use emberwatch_learning::policy::Policy;
@@ -38,7 +38,7 @@ pub struct WorldRun {
 
 impl WorldRun {
     /// Starts the measurement of a world. `target` is the state with the highest reward.
-    pub fn new(seed: u64, shape: Shape, target: usize, recent_steps: u32) -> Self {
+    pub fn new(seed: u64, shape: Shape, target: usize) -> Self {
         Self {
             seed,
             target,
@@ -52,7 +52,7 @@ impl WorldRun {
             brier: None,
             score: Score::default(),
             flights: Vec::new(),
-            merit: MeritTally::new(shape, target as u8, recent_steps),
+            merit: MeritTally::new(shape, target as u8, RECENT_STEPS),
         }
     }
 

@@ -45,36 +45,33 @@ pub struct CompareCommand {
     /// of policies from random to oracle; with teams: beam]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
+    /// Checkpoint of `train`, which adds learned policies to the ladder; may be given once per learner
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Vec<PathBuf>,
     /// Policy to compare the other policies with, paired by world [default: shooting; with options: the option
     /// `exploit`; with teams: the first policy; on recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
-    /// How the robots of a world act together: kinds of team, separated by commas
-    #[arg(long, value_delimiter = ',', default_value = "alone")]
-    team: Vec<Team>,
-    /// Checkpoint of `train`, which adds learned policies to the ladder; may be given once per learner
-    #[arg(long, value_name = "FILE")]
-    checkpoint: Vec<PathBuf>,
-    /// Device for networks: cpu, cuda or metal
-    #[arg(long, value_name = "DEVICE", default_value_t)]
-    device: DeviceKind,
     /// Write a CSV file with one row per policy and world
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
+    /// Draw ladder.svg, rewards.svg and teams.svg into this directory
+    #[arg(long, value_name = "DIR")]
+    figures: Option<PathBuf>,
     /// Add the rows of a CSV file measured elsewhere on the same worlds, such as by `emberwatch.benchmark` in Python;
     /// may be given several times
     #[arg(long, value_name = "FILE")]
     add: Vec<PathBuf>,
-    /// Draw ladder.svg, rewards.svg and teams.svg into this directory
-    #[arg(long, value_name = "DIR")]
-    figures: Option<PathBuf>,
+    /// How the robots of a world act together: kinds of team, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "alone")]
+    team: Vec<Team>,
+    /// Device for networks: cpu, cuda or metal
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceKind,
     /// Start known-model beliefs from each world's hidden state, instead of --prior
     #[arg(long, conflicts_with = "prior")]
     first_state_known: bool,
-    /// Steps for which a cell counts as seen after a visit, in the figures of merit
-    #[arg(long, value_name = "STEPS", default_value_t = RECENT_STEPS, value_parser = clap::value_parser!(u32).range(1..))]
-    recent_steps: u32,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Worlds")]
     worlds: WorldFlags,
     #[command(flatten)]
     settings: AgentFlags,
@@ -116,7 +113,6 @@ impl CompareCommand {
                 teams: self.team.clone(),
                 seeds,
                 steps: self.worlds.steps(task.as_ref(), arena.info())?,
-                recent_steps: self.recent_steps,
                 config: config.clone(),
                 learned: learned.clone(),
                 first_state_known: self.first_state_known,
@@ -177,7 +173,6 @@ impl CompareCommand {
         let is_here =
             |run: &&PolicyRun| run.robots == robots || !self.robots().contains(&run.robots);
         let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
-        let recent_steps = Some(comparison.recent_steps);
         for group in groups(&added) {
             let policy = group.policy;
             let mut own = comparison.policies.iter();
@@ -191,8 +186,8 @@ impl CompareCommand {
                 group
                     .runs
                     .iter()
-                    .all(|run| run.recent_steps == recent_steps),
-                "--add: policy {policy:?}: expected rows with the same --recent-steps"
+                    .all(|run| run.recent_steps == Some(RECENT_STEPS)),
+                "--add: policy {policy:?}: expected rows with recent_steps {RECENT_STEPS}"
             );
         }
         Ok(())

@@ -28,39 +28,39 @@ pub struct RunCommand {
     /// Instance name of the server
     #[arg(long, default_value = "default")]
     instance: String,
-    /// Maximum seconds to wait for the instance's server; 0: do not wait
-    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
-    wait: Duration,
-    #[arg(long, value_name = "NAME|FILE", help = format!(
-        "Refuse the server unless it has this task: {}, or a task file", listed(Task::built_in_names())))]
-    task: Option<String>,
-    /// Number of the world to act on
+    /// Policy, as a name or as BELIEF/PLANNER/GOAL; --help lists names and parts
+    #[arg(long, default_value = "beam")]
+    policy: String,
+    /// Checkpoint of `train`, for policies with a learned belief or learned decisions
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+    /// Number of steps to act; 0: until stopped
     #[arg(long, default_value_t = 0)]
-    world: u32,
+    steps: u64,
     /// The robot to fly in that world, or several as FIRST..END
     #[arg(long, value_name = "NUMBER|RANGE", default_value = "0", value_parser = parse_robots)]
     robots: Range<u32>,
     /// How the agent acts together with the other robots of the world; several robots need `joint`
     #[arg(long, default_value = "alone")]
     team: Team,
-    /// Policy, as a name or as BELIEF/PLANNER/GOAL; --help lists names and parts
-    #[arg(long, default_value = "beam")]
-    policy: String,
-    /// Number of steps to act; 0: until stopped
+    /// Number of the world to act on
     #[arg(long, default_value_t = 0)]
-    steps: u64,
+    world: u32,
     /// Maximum steps per second, to watch the robots [default: no limit]
     #[arg(long, value_name = "STEPS", value_parser = parse_rate)]
     steps_per_second: Option<f64>,
     /// Take the robots over from the client that holds them
     #[arg(long)]
     takeover: bool,
+    /// Maximum seconds to wait for the instance's server; 0: do not wait
+    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
+    wait: Duration,
+    #[arg(long, value_name = "NAME|FILE", help = format!(
+        "Refuse the server unless it has this task: {}, or a task file", listed(Task::built_in_names())))]
+    task: Option<String>,
     #[arg(long, value_name = "NAME|FILE", help = format!(
         "Model, if the server does not reveal it: {}, or a model file", listed(Model::built_in_names())))]
     model: Option<String>,
-    /// Checkpoint of `train`, for policies with a learned belief or learned decisions
-    #[arg(long, value_name = "FILE")]
-    checkpoint: Option<PathBuf>,
     /// Device for networks: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,

@@ -16,7 +16,6 @@ use crate::client::worlds::Worlds;
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_belief::merit::RECENT_STEPS;
 use emberwatch_learning::beliefs::WorldForm;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
@@ -123,7 +122,6 @@ impl SuiteCommand {
             teams: vec![if several { Team::Joint } else { Team::Alone }],
             seeds,
             steps: task.world.max_steps,
-            recent_steps: RECENT_STEPS,
             config: config.clone(),
             learned: Learned::default(),
             first_state_known: false,

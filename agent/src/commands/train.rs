@@ -43,51 +43,56 @@ const COVERAGES: [(bool, &str, &str); 2] = [
 /// Learn a model while acting.
 #[derive(Args)]
 pub struct TrainCommand {
-    /// Train on this running server, instead of simulating worlds
-    #[arg(long, conflicts_with = "settings")]
-    instance: Option<String>,
-    /// Number of the server's first world to act on
-    #[arg(long, default_value_t = 0, requires = "instance")]
-    world: u32,
-    /// Number of worlds to act on at once [default: 16; with --learner autoencoder: 1]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=MAX_WORLDS as i64))]
-    worlds: Option<u32>,
     /// What to learn [default: filter; with --preset paper: autoencoder]
     #[arg(long, value_parser = one_of_names(LEARNERS.iter().map(|kind| (kind.name, kind.about))))]
     learner: Option<String>,
+    /// Folder for checkpoint.safetensors, metrics.csv and training.svg, with a subfolder for an estimator trained first
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
     /// World steps to act, summed over all worlds; 0: until stopped [default: 0; with --learner neural or decisions:
     /// the remaining steps of the settings]
     #[arg(long)]
     steps: Option<u64>,
-    /// Estimator whose belief decisions are learned on [default: learned; with --resume: the checkpoint's]
-    #[arg(long, value_name = "NAME", value_parser = beliefs::of_options)]
-    estimator: Option<&'static BeliefKind>,
     /// Checkpoint of the --estimator from an earlier training; without it, a learned estimator is trained first. With
     /// --learner neural: a filter whose belief the network corrects
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Maximum seconds to act, including the training of an estimator
-    #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
-    time_limit: Option<Duration>,
-    /// Folder for checkpoint.safetensors, metrics.csv and training.svg, with a subfolder for an estimator trained first
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
     /// Resume from the folder's checkpoint, bit for bit if the worlds are where the checkpoint left them
     #[arg(long)]
     resume: bool,
+    /// Estimator whose belief decisions are learned on [default: learned; with --resume: the checkpoint's]
+    #[arg(long, value_name = "NAME", value_parser = beliefs::of_options)]
+    estimator: Option<&'static BeliefKind>,
+    /// Maximum seconds to act, including the training of an estimator
+    #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
+    time_limit: Option<Duration>,
     /// Cells that frames show to a filter in training [default: from the settings; with --resume: the checkpoint's]
     #[arg(long = "coverage", value_name = "CELLS", value_parser = one_of(&COVERAGES))]
     full_frames: Option<bool>,
     /// Device for an autoencoder or a neural belief: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
+    /// Train on this running server, instead of simulating worlds
+    #[arg(help_heading = "Worlds", long, conflicts_with = "settings")]
+    instance: Option<String>,
+    /// Number of the server's first world to act on
+    #[arg(
+        help_heading = "Worlds",
+        long,
+        default_value_t = 0,
+        requires = "instance"
+    )]
+    world: u32,
+    /// Number of worlds to act on at once [default: 16; with --learner autoencoder: 1]
+    #[arg(help_heading = "Worlds", long, value_parser = clap::value_parser!(u32).range(1..=MAX_WORLDS as i64))]
+    worlds: Option<u32>,
     /// Take the worlds over from the client that holds them
-    #[arg(long, requires = "instance")]
+    #[arg(help_heading = "Worlds", long, requires = "instance")]
     takeover: bool,
     /// Seed of the first world
-    #[arg(long, default_value_t = FIRST_TRAINING_SEED, conflicts_with = "instance")]
+    #[arg(help_heading = "Worlds", long, default_value_t = FIRST_TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Worlds")]
     simulation: SimulationFlags,
     #[command(flatten)]
     settings: AgentFlags,

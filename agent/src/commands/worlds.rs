@@ -68,11 +68,10 @@ impl Args for SimulationFlags {
         ));
         let burn_in =
             "Number of steps simulated before k = 0 [default: 25000; `train --preset paper`: 0]";
-        Flags::<WorldSettings>::augment_args(command)
+        Flags::<WorldSettings>::augment_args(command.arg(task))
             .mut_group("settings", |group| group.arg("task"))
             .mut_arg("burn_in", |flag| flag.help(burn_in))
             .mut_arg("robots", |flag| flag.value_delimiter(','))
-            .arg(task)
     }
 
     fn augment_args_for_update(command: Command) -> Command {

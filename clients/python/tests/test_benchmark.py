@@ -55,11 +55,9 @@ def states(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("robots", "recent_steps", "policy"), [(3, 2, "known/beam/exploit"), (1, 3, "coverage")]
-)
+@pytest.mark.parametrize(("robots", "policy"), [(3, "known/beam/exploit"), (1, "coverage")])
 def test_replayed_paths_have_exactly_the_same_scores(
-    tmp_path: Path, states: Path, robots: int, recent_steps: int, policy: str
+    tmp_path: Path, states: Path, robots: int, policy: str
 ) -> None:
     settings, worlds = FLAGS, WORLDS
     if policy == "coverage":  # needs no model, as recorded worlds have none
@@ -76,7 +74,7 @@ def test_replayed_paths_have_exactly_the_same_scores(
             while not client.status().n_observers:
                 pass
         flags = [f"--instance={running.instance}", f"--csv={csv}", "--team=joint"]
-        compare(f"--policies={policy}", f"--recent-steps={recent_steps}", *flags)
+        compare(f"--policies={policy}", *flags)
     finally:
         recorder.terminate()
         recorder.wait(20)
@@ -88,7 +86,7 @@ def test_replayed_paths_have_exactly_the_same_scores(
         step = next(steps)
         return np.concatenate([paths[seed, step] for seed in range(3, 7)]).astype(np.int64)
 
-    keywords = {**worlds, **SCALE, "robots": robots, "recent_steps": recent_steps}
+    keywords = {**worlds, **SCALE, "robots": robots}
     rows = [figures(row) for row in evaluate(again, name="again", env=WILDFIRE, **keywords)]
     assert rows == [figures(row) for row in read(csv)]
     assert len(rows) == 4 and None not in [value for row in rows for value in row.values()]

@@ -44,7 +44,6 @@ def evaluate(
     estimator: str | None = None,
     deterministic: bool = True,
     batch: int = 32,
-    recent_steps: int = RECENT_STEPS,
     wrap: Callable[[Any], Any] | None = None,
     csv: str | os.PathLike[str] | None = None,
     append: bool = False,
@@ -71,9 +70,6 @@ def evaluate(
             `observation` has a belief, otherwise `none`.
         deterministic: Argument of `predict`.
         batch: Number of worlds to simulate at the same time, in the order of the seeds.
-        recent_steps: Number of steps for which a cell counts as seen after a visit, in the figures
-            of merit. Figures that need hidden states or their description are None if a running
-            server does not publish them, or with `truth=False`.
         wrap: A function that wraps the worlds (a `VecEnv` of Stable-Baselines3) as in the training,
             for example `lambda worlds: VecFrameStack(worlds, 4)`, or for a saved model
             `lambda worlds: VecNormalize.load("statistics.pkl", worlds)`. Statistics stay unchanged.
@@ -103,7 +99,7 @@ def evaluate(
             raise invalid(what, "a name for the table", repr_of(text))
     if env not in (_MOVES, _PATHS):
         raise invalid("env", f"{_MOVES!r} or {_PATHS!r}", repr_of(env))
-    for what, number in {"steps": steps, "batch": batch, "recent_steps": recent_steps}.items():
+    for what, number in {"steps": steps, "batch": batch}.items():
         as_count(number, what, 1, 2**32 - 1)
     chosen = (task.test_seeds if task else range(8)) if seeds is None else as_list(seeds, "seeds")
     chosen = [as_seed(seed) for seed in chosen]
@@ -123,7 +119,7 @@ def evaluate(
         "robots": n_robots,
         "team": "shared" if n_robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,
-        "recent_steps": recent_steps,
+        "recent_steps": RECENT_STEPS,
         "worlds_fingerprint": fingerprint,
     }
     played = {(fingerprint, seed, steps) for seed in chosen}
@@ -191,7 +187,7 @@ def _play(
     """Scores a policy on the worlds of some seeds, all at the same time."""
     steps = columns["steps"]
     with made(len(seeds)) as (worlds, shown):
-        tally = Tally(worlds.world_spec, len(seeds), columns["recent_steps"])
+        tally = Tally(worlds.world_spec, len(seeds))
         actor.begin(len(seeds), worlds.num_envs)
         seen, _ = shown.reset(seed=np.repeat(seeds, columns["robots"]).tolist())
         if (worlds.lease.client.info.worlds_fingerprint or "") != columns["worlds_fingerprint"]:

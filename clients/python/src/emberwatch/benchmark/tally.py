@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief.merit import MeritTally
+from emberwatch.belief.merit import RECENT_STEPS, MeritTally
 from emberwatch.benchmark.rows import Row
 from emberwatch.envs.observations import cells_of
 from emberwatch.envs.settings import WorldSpec
@@ -19,11 +19,11 @@ from emberwatch.model.moves import fly
 class Tally:
     """Sums of results over the steps of several worlds, one entry for each world."""
 
-    def __init__(self, spec: WorldSpec, n_worlds: int, recent_steps: int) -> None:
+    def __init__(self, spec: WorldSpec, n_worlds: int) -> None:
         self._spec: Final = spec
         target = 0 if spec.described is None else spec.described.target_state
         grid = spec.height, spec.width
-        self._merit = MeritTally(n_worlds, grid, target=target, recent_steps=recent_steps)
+        self._merit = MeritTally(n_worlds, grid, target=target, recent_steps=RECENT_STEPS)
         self._reward = np.zeros(n_worlds)
         counts = np.zeros((4, n_worlds), np.int64)
         self._n_visited, self._n_visits, self._n_hits, self._n_fire = counts

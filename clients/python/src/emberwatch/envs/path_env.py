@@ -76,9 +76,9 @@ class WildfireEnv(WorldEnv):
 
     With `instance` and for example `robot=2`, the environment flies one robot of a world, and other
     processes fly the other robots. A step waits for the paths of all robots that a client holds,
-    but no longer than the server's `--deadline-millis`. A path that comes too late is not flown: the
-    step returns the world's current results, and `info["n_missed"]` is the number of steps in which
-    this robot stayed where it was. `reset` begins no episode, because other clients share the
+    but no longer than the server's `--deadline-millis`. A path that comes too late is not flown:
+    the step returns the world's current results, and `info["n_missed"]` is the number of steps in
+    which this robot stayed where it was. `reset` begins no episode, because other clients share the
     world. It joins the current episode, and uses the argument `seed` only for `np_random`. To fly
     all robots of a world, use `emberwatch.parallel_env`.
 
