@@ -40,7 +40,9 @@ def test_names_match_the_programs() -> None:
         assert Model.named(name).name == Model.named(Path(name)).name == name
     command = [find("emberwatch-agent"), "run", "--model=no/such"]
     words = subprocess.run(command, capture_output=True, text=True).stderr
-    known = re.search(r"no/such: No such file: expected a model file, or one of (.*)", words)
+    known = re.search(
+        r"no/such: No such file or directory .*: expected a file, or one of (.*)", words
+    )
     assert known is not None and set(known[1].split(", ")) == set(names)
 
 

@@ -120,5 +120,5 @@ def test_mismatched_input_is_refused(tmp_path: Path, states: Path) -> None:
     for keywords, words in wrong:
         with pytest.raises((InvalidArgumentError, EmberwatchError), match=words):
             gymnasium.make(WILDFIRE, **(usual | keywords))
-    with refuses("expected false and 0 without a states file"):
+    with refuses("states_offset: expected 0 without a states file, got 3"):
         gymnasium.make(WILDFIRE, states_offset=3)

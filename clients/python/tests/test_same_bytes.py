@@ -197,7 +197,7 @@ def cases(attaches: bool) -> dict[str, Callable[[], Outcomes]]:
         "wildfire, all parts": functools.partial(single, WILDFIRE, 4, T, **path),
         "moves": functools.partial(single, MOVES, 4, **where),
         "moves, all parts": functools.partial(single, MOVES, 4, **moves),
-        "objective": functools.partial(single, OBJECTIVE, 8, **where),
+        "objective": functools.partial(single, OBJECTIVE, 8, estimator="known", **where),
         "team, paths": functools.partial(team, "path", 4, T, reward="team", truth=True, **where),
         "team, moves": functools.partial(team, "move", 4, **team_moves),
         "lease": functools.partial(lease, **where),
@@ -213,7 +213,7 @@ def cases(attaches: bool) -> dict[str, Callable[[], Outcomes]]:
             f"wildfire, {mode.name}": functools.partial(of_paths, **path),
             f"moves, {mode.name}": functools.partial(of_moves, **moves),
             f"objective, {mode.name}": functools.partial(
-                vector, OBJECTIVE, mode, 8, truth=True, **where
+                vector, OBJECTIVE, mode, 8, estimator="known", truth=True, **where
             ),
         }
     if attaches:
