@@ -148,8 +148,8 @@ def test_a_server_that_is_killed_is_waited_for_whatever_its_grid(watched, progra
 def test_another_agent_takes_over(watched, programs):
     server, look = watched.server, watched.look
     look.eventually(lambda: look.text("policy") == "beam", "the first policy")
-    programs.agent(server.instance, policy="shooting", takeover=True)
-    look.eventually(lambda: look.text("policy") == "shooting", "the new policy")
+    programs.agent(server.instance, policy="known/shooting/explore", takeover=True)
+    look.eventually(lambda: look.text("policy") == "known/shooting/explore", "the new policy")
     look.eventually(lambda: look.text("objective") == "entropy", "what its first path is for")
 
 

@@ -60,11 +60,11 @@ def check_marks(look) -> None:
 def test_a_team_of_an_agent_that_flies_one_that_hangs_and_nobody(programs, open_page):
     server = programs.server(robots=3, deadline_millis=50, lease_millis=600_000, publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
-    hanging = programs.agent(server.instance, robot=1)
+    hanging = programs.agent(server.instance, robots=1)
     look.eventually(lambda: states(look) == ["hovered", "flew", "hovered"], "it flies alone")
     look.eventually(lambda: look.text("believer") == "robot 1", "whose belief it is")
     hanging.suspend()
-    flying = programs.agent(server.instance, robot=0)
+    flying = programs.agent(server.instance, robots=0)
     look.eventually(lambda: states(look) == ["flew", "late", "hovered"], "two of them")
     look.eventually(lambda: look.text("believer") == "robot 0", "another belief")
     look.wait_for_steps()
