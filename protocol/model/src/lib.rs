@@ -2,8 +2,8 @@
 //!
 //! This crate knows nothing of messages. All other modules index a [`grid`]. [`dynamics`] draws hidden states, and
 //! [`transition`] applies the same operator to beliefs. [`path`] and [`frame`] represent a robot's moves and
-//! observations. [`settings`] define worlds, a [`task`] is a named set of worlds, and [`built_in`] contains the models, tasks and recorded states
-//! that ship with the programs. [`text`] reads settings and model files.
+//! observations. [`mod@settings`] define worlds, a [`task`] is a named set of worlds, and [`built_in`] contains the models,
+//! tasks and recorded states that ship with the programs. [`text`] reads settings and model files.
 
 mod airspace;
 pub mod built_in;

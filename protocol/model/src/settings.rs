@@ -46,7 +46,7 @@ pub struct Setting {
     pub for_servers: bool,
 }
 
-/// A struct of settings, which [`settings!`](crate::settings) declares.
+/// A struct of settings, which [`settings!`](crate::settings!) declares.
 pub trait Settings: Default + Serialize + DeserializeOwned {
     /// Lists the settings in the order of their declarations.
     fn settings() -> Vec<Setting>;
