@@ -4,9 +4,8 @@ use crate::commands::{agent, check, check_table};
 use crate::trainings::{COMPARED, Place, WORLDS, on};
 use emberwatch_learning::checkpoint::{self, Contents};
 use emberwatch_learning::learners::filter::SavedFilter;
-use emberwatch_protocol::Move;
 use rustix::process::Signal;
-use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly};
+use tests::harness::{AGENT, Ended, LIMIT, Program, SMALL, Server};
 
 /// Settings with which learning starts after 16 world steps, summed over two worlds.
 const SETTINGS: &str = "[learning]
@@ -27,8 +26,7 @@ fn n_updates(contents: &Contents) -> u64 {
     contents
         .state::<SavedFilter>()
         .expect("its state")
-        .fit
-        .n_updates()
+        .n_updates
 }
 
 fn updates(row: &[String]) -> u64 {
@@ -66,33 +64,71 @@ fn a_training_that_made_no_update_says_why() {
     }
 }
 
+/// Returns the seed of the first world that a training reports.
+fn first_seed(ended: &Ended) -> u64 {
+    let (_, seed) = ended.stderr.split_once("seed=").expect("a seed");
+    let digits = seed.split(|letter: char| !letter.is_ascii_digit());
+    digits
+        .into_iter()
+        .next()
+        .unwrap_or_default()
+        .parse()
+        .expect("a number")
+}
+
 #[test]
-fn training_goes_on_bit_for_bit_where_it_stopped() {
+fn each_piece_of_a_training_sees_new_worlds_and_counts_on() {
     let place = place();
-    place.set(&format!("{SETTINGS}[objective]\nbelief = \"estimate\"\n"));
-    let train = |out: &str, stops: &[u64]| {
-        let server = Server::start(&format!("{SMALL} --worlds 2 --seed 4"));
-        let mut done = 0;
-        for stop in stops {
-            let resume = if done > 0 { "--resume" } else { "" };
-            let flags = format!("--worlds 2 --steps {} {resume}", stop - done);
-            let ended = place.train(out, &format!("{} {flags}", on(&server)));
-            assert!(!ended.stderr.contains("start anew"), "{}", ended.stderr);
-            // The number of steps is even, because the two worlds always step together.
-            done = stop.next_multiple_of(2);
+    let server = Server::start(&format!("{SMALL} --worlds 2 --seed 4"));
+    let on = format!("{} --worlds 2", on(&server));
+    for (out, worlds, first) in [("in", WORLDS, 1000), ("on", &on, 4)] {
+        let mut seeds = vec![first_seed(
+            &place.train(out, &format!("{worlds} --steps 80")),
+        )];
+        assert_eq!(seeds[0], first);
+        place.refuse(out, worlds, "--out | add --resume");
+        for n_steps in [140, 200] {
+            let before = place.rows(out);
+            let ended = place.train(out, &format!("{worlds} --steps 60 --resume"));
+            ended.check_says("resumed in new worlds, with an empty replay buffer");
+            seeds.push(first_seed(&ended));
+            let rows = place.rows(out);
+            let [last, first] = [before.len() - 1, before.len()].map(|row| &rows[row]);
+            assert_eq!(rows[..before.len()], before);
+            assert_eq!(updates(first), updates(last), "an empty replay at first");
+            let end = rows.last().expect("rows");
+            assert!(updates(end) > updates(first));
+            assert_eq!(end[1], n_steps.to_string());
         }
-        (place.rows(out), place.contents(out))
-    };
-    let (rows, whole) = train("whole", &[200]);
-    // Stops the training three times: during the random walk, within a block and a window, and after the first updates.
-    let (rows_of_parts, parts) = train("parts", &[22, 61, 100, 200]);
-    assert_eq!(rows, rows_of_parts);
-    let losses: Vec<f64> = rows.iter().filter_map(|row| row[2].parse().ok()).collect();
-    assert!(losses.len() > 80, "{losses:?}");
-    assert!(losses.iter().all(|loss| loss.is_finite()), "{losses:?}");
-    assert_eq!(rows.last().map(|row| &*row[1]), Some("200"));
-    // Equal checkpoints have equal parameters, moments, replay buffers, streams and beliefs.
-    assert!(whole == parts, "checkpoints differ");
+        seeds.sort_unstable();
+        seeds.dedup();
+        assert_eq!(seeds.len(), 3, "{seeds:?}");
+    }
+}
+
+#[test]
+fn a_folder_has_one_training_at_a_time_and_a_link_stays_one() {
+    let place = place();
+    let server = Server::start(&format!("{SMALL} --worlds 2"));
+    let first = Program::start(
+        AGENT,
+        &place.words("out", &format!("{} --worlds 2", on(&server))),
+    );
+    first.until(|| server.status().n_steps > 4);
+    place.refuse(
+        "out",
+        WORLDS,
+        "--out | expected a folder in which no training runs",
+    );
+    first.signal(Signal::INT);
+    first.wait(LIMIT).check(0);
+    let (link, target) = (place.checkpoint("out"), place.folder.path("elsewhere"));
+    std::fs::rename(&link, &target).expect("moved");
+    std::os::unix::fs::symlink(&target, &link).expect("linked");
+    let before = std::fs::read(&target).expect("a checkpoint");
+    place.train("out", &format!("{WORLDS} --steps 20 --resume"));
+    assert!(link.is_symlink());
+    assert!(std::fs::read(&target).expect("a checkpoint") != before);
 }
 
 #[test]
@@ -127,15 +163,10 @@ fn a_server_and_worlds_in_the_process_teach_the_same() {
 #[test]
 fn a_filter_learns_from_frames_that_show_every_cell() {
     let place = place();
-    place.train("path", &format!("{WORLDS} --steps 120"));
-    place.train("full", &format!("{WORLDS} --steps 120 --coverage full"));
-    // With full frames, the replay buffer stores 54 cells per step. Otherwise it stores at most six, the cells on a
-    // path of five moves.
-    let size = |out: &str| place.bytes(out).len();
-    assert!(2 * size("full") > 3 * size("path"));
-    // On a new server the replay buffer starts empty, and fills with full frames again.
-    place.train("full", &format!("{WORLDS} --steps 120 --resume"));
-    assert!(2 * size("full") > 3 * size("path"));
+    for (out, flags) in [("path", ""), ("full", "--coverage full")] {
+        place.train(out, &format!("{WORLDS} --steps 60 {flags}"));
+    }
+    assert!(place.contents("path").tensors != place.contents("full").tensors);
     let server = Server::start(SMALL);
     for (out, flags, words) in [
         (
@@ -156,36 +187,6 @@ fn a_filter_learns_from_frames_that_show_every_cell() {
     ] {
         place.refuse(out, flags, words);
     }
-}
-
-#[test]
-fn other_worlds_begin_new_tracks_and_an_empty_replay() {
-    let place = place();
-    let before = place.learn("out", &format!("{WORLDS} --steps 80"));
-    place.refuse("out", WORLDS, "--out | add --resume");
-    let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
-    ended.check_says("beliefs start anew robots=2");
-    let rows = place.rows("out");
-    let [last, first] = [before.len() - 1, before.len()].map(|row| &rows[row]);
-    assert_eq!(first[1], "82", "world steps go on");
-    assert_eq!(updates(first), updates(last), "an empty replay at first");
-    let end = rows.last().expect("rows");
-    assert!(updates(end) > updates(first));
-    assert_eq!(end[1], "140");
-}
-
-#[test]
-fn a_moved_world_begins_a_new_track_and_keeps_the_replay() {
-    let place = place();
-    let server = Server::start(&format!("{SMALL} --worlds 2 --max-steps 9"));
-    let flags = format!("{} --worlds 2", on(&server));
-    let n_rows = place.learn("out", &format!("{flags} --steps 60")).len();
-    assert_eq!([0, 1].map(|world| server.step_of(world)), [30 % 9; 2]);
-    fly(&mut server.acquire(0..1), vec![Move::from_low_bits(0); 6]);
-    let ended = place.train("out", &format!("{flags} --steps 60 --resume"));
-    ended.check_says("beliefs start anew robots=1");
-    let rows = place.rows("out");
-    assert!(updates(&rows[n_rows]) > updates(&rows[n_rows - 1]));
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! Trains a learner while it acts: a loop of steps of all robots, updates, and checkpoints at intervals.
 //!
 //! The learner receives the grid, the number of observation values, and each path's reward and frame. A model that the
-//! server reveals is read only for decisions on a known-model belief. One request moves all robots by one step. The [`Learner`] determines what is learned, and how to act in the meantime.
+//! server reveals is read only for decisions on a known-model belief. One request moves all robots by one step. The
+//! [`Learner`] determines what is learned, and how to act in the meantime.
 
 mod acting;
 pub mod metrics;
@@ -14,7 +15,7 @@ use self::acting::Acting;
 use crate::client::worlds::Worlds;
 use crate::training::metrics::{METRICS, Metrics, Tick};
 use crate::training::seconds::Stopwatch;
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_learning::checkpoint::{self, Contents};
 use emberwatch_learning::learners::{self, Beginning, Learner, LearnerKind, ModelUpdate};
@@ -24,6 +25,8 @@ use emberwatch_protocol::client::{Backend, Claim, Client, Observation};
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::WorldSeed;
 use emberwatch_protocol::feed::Feed;
+use std::fs::{File, TryLockError};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -84,6 +87,8 @@ struct TrainingLoop<'a> {
     n_before: u64,
     saved: Instant,
     reported: Reported,
+    /// The lock of the training's folder, held until the training ends.
+    _lock: File,
 }
 
 /// Totals at the last progress report, and the score since then.
@@ -100,6 +105,7 @@ impl<'a> TrainingLoop<'a> {
         spec: &TrainingSpec,
         contents: Option<Contents>,
     ) -> Result<Self> {
+        let lock = lock(&spec.out)?;
         let stopwatch = Stopwatch::start(&spec.out, spec.resume)?;
         if let Some(contents) = &contents
             && contents.settings().map_or(true, |it| it != spec.config)
@@ -115,15 +121,21 @@ impl<'a> TrainingLoop<'a> {
         let kind = spec.learner()?;
         let mut learner = begin(spec, kind, &client, contents.as_ref())?;
         let metrics = metrics(spec, kind, &*learner)?;
-        let attached = learner.attach(running(&mut client)?);
-        let n_resumed = attached.map_err(|problem| spec.stopped(problem, &*learner))?;
-        let n_new = client.robots().len() - n_resumed;
-        if spec.resume && n_new > 0 {
-            let robots = n_new;
+        let observations = first_observations(&mut client, spec)?;
+        let seed = observations[0].world.seed;
+        if spec.resume {
+            let world_steps = learner.world_steps();
             tracing::info!(
-                robots,
-                "the worlds of some robots have changed since the checkpoint: their beliefs start anew"
+                seed,
+                world_steps,
+                "resumed in new worlds, with an empty replay buffer"
             );
+        } else {
+            tracing::info!(seed, "the first world");
+        }
+        for (robot, observation) in client.robots().zip(observations) {
+            let begun = learner.begin(robot, observation);
+            begun.map_err(|problem| spec.stopped(problem, &*learner))?;
         }
         let belief = learner.rollout(0).agent.belief();
         let feed = client.backend().feed(belief.probabilities());
@@ -139,6 +151,7 @@ impl<'a> TrainingLoop<'a> {
             summary: TrainSummary::default(),
             saved: now,
             reported: Reported::at(now, &TrainSummary::default()),
+            _lock: lock,
         })
     }
 
@@ -270,8 +283,31 @@ fn begin(
     }
 }
 
-/// Returns the observations of the client's robots. Worlds whose episode has ended start their next episode first.
-fn running(client: &mut Client<impl Backend>) -> Result<Vec<Observation>, ConnectionError> {
+/// Locks a training's folder until the file is dropped.
+fn lock(folder: &Path) -> Result<File> {
+    let file = File::open(folder).with_context(|| format!("--out {}", folder.display()))?;
+    // File systems without locks are used without one.
+    let is_free = !matches!(file.try_lock(), Err(TryLockError::WouldBlock));
+    ensure!(
+        is_free,
+        "--out {}: expected a folder in which no training runs, got one with a running training",
+        folder.display()
+    );
+    Ok(file)
+}
+
+/// Returns the first observations of the client's robots. Worlds start the episodes of the training's seeds, if it has
+/// any. Otherwise, their episodes continue, or the next begin where one has ended.
+fn first_observations(
+    client: &mut Client<impl Backend>,
+    spec: &TrainingSpec,
+) -> Result<Vec<Observation>, ConnectionError> {
+    if let Some(first) = spec.first_seed {
+        let seeds = (first..).map(Some);
+        let worlds = spec.worlds.clone().zip(seeds);
+        let worlds = worlds.map(|(world, seed)| WorldSeed { world, seed });
+        client.reset(&worlds.collect::<Vec<_>>())?;
+    }
     let mut observations = client.observe(client.robots())?;
     let over = ended(client, observations.iter());
     for (robot, seen) in reset(client, &over)? {

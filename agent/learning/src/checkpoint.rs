@@ -1,5 +1,6 @@
-//! Checkpoints: everything that a learner keeps between runs, in one safetensors file. Weights and the optimiser's
-//! moments are named tensors. All other state is encoded with bincode in the byte tensor `state`.
+//! Checkpoints: what a learner has learned, in one safetensors file. Weights and the optimiser's moments are named
+//! tensors. Counters and estimates are encoded with bincode in the byte tensor `state`. Replay buffers and the beliefs
+//! of robots are not saved: a resumed training fills and begins them again.
 //!
 //! A checkpoint is written to a temporary file and renamed, so that readers always find a complete file. The file
 //! records its kind of learner and its format, and contains a digest that reveals damage. Equal contents produce equal
@@ -9,8 +10,6 @@ use crate::config::AgentConfig;
 use crate::file::{Readers, replace_file};
 use anyhow::{Context, Result, anyhow, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
-use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_model::Shape;
 use emberwatch_model::text::shortened;
 use emberwatch_network::NamedTensor;
 use safetensors::tensor::TensorView;
@@ -37,8 +36,14 @@ const STATE: &str = "state";
 const FORM: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// Maximum size of a checkpoint in bytes: 200 times its size with a full replay buffer for 64 x 64 cells and 3 states.
+/// The format of all checkpoints.
+const VERSION: &str = "6";
+
+/// Maximum size of a checkpoint in bytes.
 const MAX_BYTES: u64 = 1 << 32;
+
+/// Maximum memory for a decoded state in bytes, so that a small file cannot exhaust memory.
+const MAX_STATE_BYTES: usize = 1 << 24;
 
 /// Maximum value of a saved counter, low enough that increments cannot overflow.
 const MAX_COUNT: u64 = 1 << 53;
@@ -86,13 +91,8 @@ impl Contents {
 
     /// Decodes the state into the learner's type `S`.
     pub fn state<S: DeserializeOwned>(&self) -> Result<S> {
-        use bincode::serde::decode_from_slice as decode;
-        // The memory limit is a const parameter. It is low for small files, so that they cannot exhaust memory.
-        let decoded = match self.state.len() {
-            0..0x1_0000 => decode(&self.state, FORM.with_limit::<0x10_0000>()),
-            0x1_0000..0x100_0000 => decode(&self.state, FORM.with_limit::<0x1000_0000>()),
-            _ => decode(&self.state, FORM.with_limit::<{ MAX_BYTES as usize }>()),
-        };
+        let form = FORM.with_limit::<MAX_STATE_BYTES>();
+        let decoded = bincode::serde::decode_from_slice(&self.state, form);
         let (state, length) =
             decoded.map_err(|error| wrong(STATE, "the state of its learner", error))?;
         let got = self.state.len();
@@ -139,10 +139,7 @@ impl Contents {
     pub fn settings(&self) -> Result<AgentConfig> {
         let is_there = !self.settings.is_empty();
         check(is_there, SETTINGS, "the settings of an agent", "none")?;
-        // Earlier versions also saved the kind of kernels.
-        let lines = self.settings.lines();
-        let lines = lines.filter(|line| !line.starts_with("kernels = "));
-        let config = AgentConfig::from_toml(&lines.collect::<Vec<_>>().join("\n"));
+        let config = AgentConfig::from_toml(&self.settings);
         config.map_err(|error| wrong(SETTINGS, "the settings of an agent", error))
     }
 
@@ -179,12 +176,6 @@ impl Part<'_> {
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         self.contents
             .tensor(&format!("{}{name}", self.prefix), expected)
-    }
-
-    /// Returns the shape of a tensor, if it exists.
-    pub fn shape(&self, name: &str) -> Option<&[usize]> {
-        let tensor = self.contents.tensors.get(&format!("{}{name}", self.prefix));
-        tensor.map(|tensor| &*tensor.shape)
     }
 }
 
@@ -242,7 +233,7 @@ pub fn encode(kind: &str, contents: &Contents) -> Result<Vec<u8>> {
     let views = views.collect::<Result<Vec<_>, _>>().map_err(damaged)?;
     let texts = [
         (KIND, kind),
-        (FORMAT, version(kind)),
+        (FORMAT, VERSION),
         (DIGEST, &contents.digest()),
         (SETTINGS, &contents.settings),
     ];
@@ -251,14 +242,6 @@ pub fn encode(kind: &str, contents: &Contents) -> Result<Vec<u8>> {
     sort_header(&mut bytes);
     check_size(bytes.len() as u64)?;
     Ok(bytes)
-}
-
-/// Returns the format of a kind of checkpoint. In format 5, each transition of a DQN stores its own discount.
-fn version(kind: &str) -> &'static str {
-    match kind {
-        "autoencoder" | "decisions" => "5",
-        _ => "4",
-    }
 }
 
 /// Sorts the header by key, because safetensors writes metadata in the random order of a hash map. Keeps the length.
@@ -280,13 +263,13 @@ pub fn decode(bytes: &[u8]) -> Result<(String, Contents)> {
     let kind = texts
         .remove(KIND)
         .with_context(|| format!("{KIND}: expected the name of a learner, got none"))?;
-    let (expected, got) = (version(&kind), texts.remove(FORMAT));
-    check(
-        got.as_deref() == Some(expected),
-        FORMAT,
-        expected,
-        got.as_deref().unwrap_or("none"),
-    )?;
+    let format = texts.remove(FORMAT);
+    let got = format.as_deref().unwrap_or("none");
+    ensure!(
+        got == VERSION,
+        "{FORMAT}: expected {VERSION}, got {}, of another release: train it again",
+        shortened(got)
+    );
     let mut contents = Contents::new([], &());
     contents.settings = texts.remove(SETTINGS).unwrap_or_default();
     for (name, view) in file.iter() {
@@ -334,17 +317,6 @@ pub fn wrong(name: &str, expected: impl Display, got: impl Display) -> anyhow::E
     anyhow!("{name}: expected {expected}, got {got:#}")
 }
 
-/// Checks a saved number of updates that are due. The maximum exceeds the number that one step of all worlds can add.
-pub fn check_earned(earned: f64) -> Result<()> {
-    const MAX: f64 = 2e6;
-    check(
-        (0.0..MAX).contains(&earned),
-        "earned",
-        format!("0 to {MAX}"),
-        earned,
-    )
-}
-
 pub fn check_counts(counts: &[(&str, u64)]) -> Result<()> {
     let expected = format!("at most {MAX_COUNT}");
     let mut counts = counts.iter();
@@ -358,13 +330,6 @@ pub fn check_numbers<T: Copy + Into<f64>>(name: &str, numbers: &[T], length: usi
     let got = wrong.unwrap_or(numbers.len() as f64);
     let fits = wrong.is_none() && numbers.len() == length;
     check(fits, name, format!("{length} finite numbers"), got)
-}
-
-/// Checks a belief's number of states and its grid.
-pub fn check_belief(name: &str, belief: &Belief, n_states: usize, shape: Shape) -> Result<()> {
-    let expected = format!("{n_states} states on {shape}");
-    let got = format!("{} states on {}", belief.n_states(), belief.shape());
-    check(got == expected, name, &expected, &got)
 }
 
 #[cfg(test)]

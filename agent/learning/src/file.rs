@@ -20,6 +20,8 @@ pub enum Readers {
 /// # Errors
 /// If the system reports an error. The error names the file, which remains unchanged.
 pub fn replace_file(path: &Path, bytes: &[u8], readers: Readers) -> Result<()> {
+    // A link stays one, and its target is replaced.
+    let path = &std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
     let written = || {
         let (temporary, mut file) = create_temporary(path, readers)?;
         let written = file

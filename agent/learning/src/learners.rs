@@ -8,12 +8,11 @@ pub mod decisions;
 pub mod filter;
 pub mod network;
 pub mod neural;
-mod resume_point;
 #[cfg(test)]
 pub(crate) mod tests;
 mod update;
 
-pub use self::base::{Beginning, Learner, LearnerKind, Learning, Saving, Worlds};
+pub use self::base::{Beginning, Learner, LearnerKind, Worlds};
 pub use self::update::ModelUpdate;
 
 use crate::checkpoint::{self, Contents};

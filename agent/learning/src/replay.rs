@@ -5,16 +5,13 @@
 //! belief whenever it has processed the preceding block. A block is replayed once it is full or its track has ended.
 //! When the buffer is full, the oldest blocks are dropped.
 
-use crate::checkpoint::{check, check_counts, check_numbers, wrong};
-use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_gradient::Sighting;
-use emberwatch_model::{Frame, Probabilities, Shape};
-use serde::{Deserialize, Serialize};
+use emberwatch_model::Frame;
 use std::collections::BTreeMap;
 
 /// Consecutive frames of one track, at least one.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Block {
     pub frames: Vec<Vec<Sighting>>,
     /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
@@ -23,7 +20,7 @@ pub struct Block {
     next: u64,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct BlockReplay {
     block_length: usize,
     max_frames: usize,
@@ -53,10 +50,6 @@ impl BlockReplay {
         {
             self.keep(number, last);
         }
-    }
-
-    pub fn has_track(&self, robot: u32) -> bool {
-        self.open.contains_key(&robot)
     }
 
     /// Adds the next frame of a robot's track. `before` is the belief before the frame, if there is one.
@@ -109,44 +102,6 @@ impl BlockReplay {
         }
     }
 
-    /// Loads the contents of a saved buffer with blocks of the same length. If they exceed the capacity, the newest
-    /// blocks are kept.
-    ///
-    /// # Errors
-    /// If the saved buffer is invalid, or belongs to another grid, model or sensor.
-    pub fn resume(
-        &mut self,
-        other: Self,
-        shape: Shape,
-        n_states: usize,
-        n_observations: usize,
-    ) -> Result<()> {
-        let full = other
-            .full
-            .iter()
-            .map(|(number, block)| (*number, block, true));
-        let open = other.open.values();
-        let open = open.map(|(number, block)| (*number, block, false));
-        for (number, block, is_full) in full.chain(open) {
-            let fits = number < other.n_opened;
-            let expected = format!("numbers below {}", other.n_opened);
-            check(fits, "replay.blocks", expected, number)?;
-            let (n_frames, most) = (block.frames.len(), self.block_length);
-            let expected = if is_full { 1..=most } else { 0..=most - 1 };
-            check(
-                expected.contains(&n_frames),
-                "replay.frames",
-                format_args!("blocks of {expected:?} frames"),
-                n_frames,
-            )?;
-            block.check(shape, n_states, n_observations)?;
-        }
-        check_counts(&[("replay.n_opened", other.n_opened)])?;
-        (self.full, self.open, self.n_opened) = (other.full, other.open, other.n_opened);
-        self.drop_oldest();
-        Ok(())
-    }
-
     fn keep(&mut self, number: u64, block: Block) {
         self.full.insert(number, block);
         self.drop_oldest();
@@ -172,39 +127,10 @@ impl BlockReplay {
     }
 }
 
-impl Block {
-    fn check(&self, shape: Shape, n_states: usize, n_observations: usize) -> Result<()> {
-        for Sighting { cell, value } in self.frames.iter().flatten().copied() {
-            let fits = (cell as usize) < shape.n_cells();
-            check(fits, "replay.cell", format_args!("cells of {shape}"), cell)?;
-            let fits = usize::from(value) < n_observations;
-            check(
-                fits,
-                "replay.value",
-                format_args!("values below {n_observations}"),
-                value,
-            )?;
-        }
-        match self.start.as_deref() {
-            None => Ok(()),
-            // The placeholder of a block without frames.
-            Some([]) if self.frames.is_empty() => Ok(()),
-            Some(start) => {
-                let dim = (n_states, shape.height(), shape.width());
-                check_numbers("replay.start", start, n_states * shape.n_cells())?;
-                let start = Probabilities::from_shape_vec(dim, start.to_vec());
-                let start = start.expect("invariant: the length was checked");
-                let start = Belief::from_probabilities(start).map(drop);
-                start.map_err(|error| wrong("replay.start", "a belief", error))
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_model::Probabilities;
+    use emberwatch_model::{Probabilities, Shape};
 
     fn frame(value: u8) -> Frame {
         let shape = Shape::new(1, 3).expect("test shape");
@@ -291,62 +217,5 @@ mod tests {
         replay.begin(0);
         replay.begin(0);
         assert_eq!(replay.blocks().last(), Some(4), "no block without frames");
-        assert_eq!(resumed(replay.clone()).expect("whole"), replay);
-    }
-
-    fn resumed(other: BlockReplay) -> Result<BlockReplay> {
-        let mut replay = BlockReplay::new(2, 7);
-        let shape = Shape::new(1, 3).expect("test shape");
-        replay.resume(other, shape, 2, 9).map(|()| replay)
-    }
-
-    #[test]
-    fn a_resumed_buffer_is_equal_and_keeps_the_newest_blocks() {
-        for n_frames in 0..9 {
-            let mut before = replay(n_frames);
-            let mut after = resumed(before.clone()).expect("whole");
-            for value in 0..4 {
-                assert_eq!(before, after, "{n_frames} frames, then {value}");
-                see(&mut before, value);
-                see(&mut after, value);
-            }
-        }
-        let mut longer = replay(1);
-        longer.max_frames += 9;
-        (1..8).for_each(|value| see(&mut longer, value));
-        assert_eq!(longer.n_blocks(), 8);
-        let shorter = resumed(longer).expect("whole");
-        assert_eq!(numbers(&shorter), [5, 6, 7]);
-    }
-
-    #[test]
-    fn errors_name_invalid_contents() {
-        let check = |change: fn(&mut BlockReplay), words: &str| {
-            let mut other = replay(5);
-            change(&mut other);
-            assert_eq!(resumed(other).expect_err(words).to_string(), words);
-        };
-        fn full(replay: &mut BlockReplay) -> &mut Block {
-            replay.full.get_mut(&2).expect("kept")
-        }
-        let words = "replay.cell: expected cells of 1 x 3, got 3";
-        check(|it| full(it).frames[1][0].cell = 3, words);
-        let words = "replay.value: expected values below 9, got 9";
-        check(|it| full(it).frames[1][0].value = 9, words);
-        let words = "replay.frames: expected blocks of 1..=2 frames, got 0";
-        check(|it| full(it).frames.clear(), words);
-        let words = "replay.frames: expected blocks of 1..=2 frames, got 3";
-        check(|it| full(it).frames.push(Vec::new()), words);
-        let words = "replay.blocks: expected numbers below 3, got 3";
-        check(|it| it.n_opened = 3, words);
-        let words = "replay.n_opened: expected at most 9007199254740992, got 18446744073709551615";
-        check(|it| it.n_opened = u64::MAX, words);
-        let words = "replay.start: expected 6 finite numbers, got 0";
-        check(|it| full(it).start = Some(Vec::new()), words);
-        let words = "replay.start: expected 6 finite numbers, got NaN";
-        check(|it| full(it).start = Some(vec![f32::NAN; 6]), words);
-        let words = "replay.start: expected a belief, got belief of cell (0, 0): expected probabilities >= 0 \
-                     with sum 1, got [0.25, 0.25]";
-        check(|it| full(it).start = Some(vec![0.25; 6]), words);
     }
 }

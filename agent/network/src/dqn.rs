@@ -10,5 +10,4 @@ mod state;
 mod track;
 
 pub use learner::{Dqn, DqnSettings, DqnShape};
-pub use state::SavedDqn;
 pub use track::{Track, Transition};

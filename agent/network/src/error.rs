@@ -18,16 +18,6 @@ pub enum NetworkError {
     /// A number is not finite.
     #[error(transparent)]
     NotFinite(#[from] NotFinite),
-    /// A saved transition does not fit the DQN.
-    #[error("dqn.transitions: {at}: expected {expected}, got {got}")]
-    Transition {
-        /// Index of the transition, the oldest first.
-        at: usize,
-        /// The required properties.
-        expected: String,
-        /// The transition's properties.
-        got: String,
-    },
     /// The device failed, for example because it ran out of memory.
     #[error("the network's device: {0}")]
     Device(String),

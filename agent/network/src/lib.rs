@@ -42,7 +42,7 @@ pub use autoencoder::{Autoencoder, AutoencoderSettings};
 pub use candle_core::{Device, utils::barrier_pool};
 pub use decoder::Decoder;
 pub use device::{DeviceError, DeviceKind};
-pub use dqn::{Dqn, DqnSettings, DqnShape, SavedDqn, Track, Transition};
+pub use dqn::{Dqn, DqnSettings, DqnShape, Track, Transition};
 pub use dropout::{Dropout, Mask};
 pub use encoder::Encoder;
 pub use error::{NetworkError, NotFinite};

@@ -62,17 +62,6 @@ impl FrameReplay {
         tracks.filter(|starts| !starts.is_empty()).collect()
     }
 
-    /// Returns the frames, the oldest first.
-    pub fn frames(&self) -> impl Iterator<Item = &Frame> {
-        self.frames.iter()
-    }
-
-    /// Returns the index of the first frame of each track except the oldest.
-    pub fn tracks(&self) -> impl Iterator<Item = u64> {
-        let oldest = self.n_oldest();
-        self.begins.iter().map(move |begin| begin - oldest)
-    }
-
     /// Returns the number of frames.
     pub fn len(&self) -> usize {
         self.frames.len()

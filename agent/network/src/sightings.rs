@@ -3,7 +3,6 @@
 use crate::crop::Crop;
 use emberwatch_model::frame::{Frame, UNOBSERVED};
 use emberwatch_model::grid::Shape;
-use serde::{Deserialize, Serialize};
 
 /// Number of bytes of a [`Sighting`] in [`Sightings::to_bytes`].
 const SIGHTING_BYTES: usize = 5;
@@ -16,7 +15,7 @@ const OLDEST: usize = 4000;
 const FADING_STEPS: [f32; 3] = [10.0, 60.0, 400.0];
 
 /// The value that a cell showed, and the step in which it was seen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sighting {
     /// The observed value, or [`UNOBSERVED`] if the cell was not seen.
     pub value: u8,
@@ -25,7 +24,7 @@ pub struct Sighting {
 }
 
 /// The two latest sightings of each cell.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Sightings {
     shape: Shape,
     step: u32,

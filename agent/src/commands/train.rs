@@ -19,9 +19,11 @@ use emberwatch_network::{Device, DeviceKind};
 use emberwatch_protocol::channels::{Instance, MAX_WORLDS};
 use emberwatch_protocol::client::Backend;
 use emberwatch_protocol::control::CoverageRule;
+use emberwatch_protocol::model::randomness::{Purpose, stream};
 use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_protocol::task::FIRST_TRAINING_SEED;
 use emberwatch_sim::config::{Checked, ServerConfig};
+use rand_chacha::rand_core::Rng;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
@@ -57,7 +59,7 @@ pub struct TrainCommand {
     /// --learner neural: a filter whose belief the network corrects
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
-    /// Resume from the folder's checkpoint, bit for bit if the worlds are where the checkpoint left them
+    /// Resume from the folder's checkpoint, in worlds that the training has not seen. The replay buffer starts empty
     #[arg(long)]
     resume: bool,
     /// Estimator whose belief decisions are learned on [default: learned; with --resume: the checkpoint's]
@@ -89,9 +91,9 @@ pub struct TrainCommand {
     /// Take the worlds over from the client that holds them
     #[arg(help_heading = "Worlds", long, requires = "instance")]
     takeover: bool,
-    /// Seed of the first world
-    #[arg(help_heading = "Worlds", long, default_value_t = FIRST_TRAINING_SEED, conflicts_with = "instance")]
-    seed: u64,
+    /// Seed of the first world [default: 1000; with --resume: the next]
+    #[arg(help_heading = "Worlds", long, conflicts_with = "instance")]
+    seed: Option<u64>,
     #[command(flatten, next_help_heading = "Worlds")]
     simulation: SimulationFlags,
     #[command(flatten)]
@@ -113,7 +115,7 @@ impl TrainCommand {
             }
             let belief = training.belief_folder().join(CHECKPOINT);
             training.learned = learners::read([&*belief], &training.device)?;
-            training.resume = false;
+            (training.resume, training.first_seed) = (false, None);
         }
         learn(&mut worlds, &training, contents, &stop).map(drop)
     }
@@ -154,6 +156,7 @@ impl TrainCommand {
             deadline: None,
             out: self.out.clone(),
             resume: self.resume,
+            first_seed: None,
             learned,
             device,
             config,
@@ -202,9 +205,10 @@ impl TrainCommand {
         let kind = training.learner()?;
         if decides(kind)
             && self.resume
-            && let Some(belief) = training.adopt_belief()?
+            && let Some((belief, done)) = training.adopt_belief()?
         {
             self.adopt_estimator(belief, training)?;
+            training.first_seed = Some(self.next_seed(done));
             return Ok(None);
         }
         let contents = training.check()?;
@@ -222,9 +226,17 @@ impl TrainCommand {
                 let belief = contents.state::<SavedDecisions>()?.kind()?;
                 self.adopt_estimator(belief, training)?;
             }
-            self.limit_steps((kind.done)(contents)?, training)?;
+            let done = (kind.done)(contents)?;
+            self.limit_steps(done, training)?;
+            training.first_seed = Some(self.next_seed(done));
         }
         Ok(contents)
+    }
+
+    /// Returns the seed of the first world of a resumed training, which depends on the number of world steps done.
+    fn next_seed(&self, done: u64) -> u64 {
+        let drawn = || stream(FIRST_TRAINING_SEED, Purpose::Episode, done).next_u64() >> 11;
+        self.seed.unwrap_or_else(drawn)
     }
 
     /// Limits a resumed training to the remaining steps of the settings, unless `--steps` is given.
@@ -283,7 +295,10 @@ impl TrainCommand {
             return Ok(worlds);
         }
         let mut default = ServerConfig {
-            seed: self.seed,
+            seed: training
+                .first_seed
+                .or(self.seed)
+                .unwrap_or(FIRST_TRAINING_SEED),
             ..ServerConfig::default()
         };
         default.world.burn_in = match self.settings.preset {

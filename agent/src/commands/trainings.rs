@@ -105,6 +105,7 @@ impl Trainings<'_> {
             steps,
             deadline: None,
             resume: false,
+            first_seed: None,
             out: self.folder.join(format!("training.{}", std::process::id())),
             device: Device::Cpu,
             config,

@@ -29,6 +29,8 @@ pub struct TrainingSpec {
     pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
+    /// Seed with which the first world begins, followed by those of the others; `None`: running episodes continue.
+    pub first_seed: Option<u64>,
     pub device: Device,
     pub config: AgentConfig,
     /// Beliefs from earlier trainings, for decisions that are based on them.
@@ -94,9 +96,9 @@ impl TrainingSpec {
         Ok((belief.steps > 0).then_some(belief))
     }
 
-    /// Returns the belief that was being trained when a training of decisions was interrupted. Adopts the settings that
-    /// the belief's checkpoint determines.
-    pub fn adopt_belief(&mut self) -> Result<Option<&'static BeliefKind>> {
+    /// Returns the belief that was being trained when a training of decisions was interrupted, and the number of world
+    /// steps done. Adopts the settings that the belief's checkpoint determines.
+    pub fn adopt_belief(&mut self) -> Result<Option<(&'static BeliefKind, u64)>> {
         let place = self.belief_folder().join(CHECKPOINT);
         if self.out.join(CHECKPOINT).exists() || !place.exists() {
             return Ok(None);
@@ -111,7 +113,7 @@ impl TrainingSpec {
         };
         let learner = learners::named(by.learner).map_err(anyhow::Error::msg)?;
         (learner.adopt)(&contents, &mut self.config);
-        Ok(Some(belief))
+        Ok(Some((belief, (learner.done)(&contents)?)))
     }
 
     /// Returns the folder of [`Self::belief_training`].

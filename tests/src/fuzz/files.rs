@@ -5,23 +5,20 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_learning::beliefs::LEARNED;
-use emberwatch_learning::beliefs::autoencoder::Follower;
 use emberwatch_learning::beliefs::learned::LearnedModel;
 use emberwatch_learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use emberwatch_learning::learners::filter::fit::FilterFit;
-use emberwatch_learning::learners::filter::{FilterLearner, SavedFilter};
-use emberwatch_learning::learners::network::{Position, SavedNetwork};
-use emberwatch_learning::learners::{self, Learning, Saving, Worlds};
+use emberwatch_learning::learners::network::SavedNetwork;
+use emberwatch_learning::learners::{self, Learner, Worlds};
 use emberwatch_learning::policy::LearnedDecisions;
 use emberwatch_learning::reward::RewardEstimate;
-use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape};
+use emberwatch_network::Device;
 use emberwatch_protocol::model::ModelFile;
 use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Move, Shape};
 use ndarray::{Array3, Axis};
-use std::collections::BTreeMap;
 
 /// Number of simulated steps of a model.
 const N_STEPS: u64 = 8;
@@ -121,7 +118,10 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         // Checkpoints of the decisions learner also contain a filter, but a filter learner can resume only from its own
         // checkpoints.
         if learners::filter::FILTER.checkpoint == kind {
-            learn(&contents);
+            let mut fit = FilterFit::new(dimensions(), worlds().shape(), &config());
+            if fit.load(&contents).is_ok() {
+                see_frames(&mut fit);
+            }
         }
     }
     if learned.get::<LearnedDecisions>().is_some() {
@@ -133,18 +133,6 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         }
     }
     true
-}
-
-/// Resumes from a filter's checkpoint, if the learner accepts it, and may run an update.
-fn learn(contents: &Contents) {
-    let learner = FilterLearner::resume(contents, dimensions(), worlds(), &config());
-    if let Ok(mut learner) = learner {
-        let again = learner.contents().expect("no device");
-        let saved: SavedFilter = again.state().expect("its state");
-        // Skips learning if too many updates are due, which would take too long. Learning may fail, because finite
-        // numbers can overflow.
-        let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
-    }
 }
 
 fn dimensions() -> Dimensions {
@@ -191,10 +179,6 @@ fn base_of_filter() -> Base {
     Base::new(&LEARNED, None, learned, worlds().shape()).expect("learned")
 }
 
-fn dqn() -> Dqn {
-    Dqn::new(DqnSettings::paper(), DqnShape::of_actions(1, 2), 0)
-}
-
 pub fn checkpoint_seeds() -> Vec<Seed> {
     let encoded = |kind, contents: Contents| encode(kind, &contents).expect("they serialise");
     // The large autoencoder claims a size of 30 GiB, but no decoder may allocate so much.
@@ -210,8 +194,14 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 
 /// Returns the checkpoint of a filter learner after some frames.
 fn filter(dimensions: Dimensions) -> Contents {
-    let (shape, config) = (worlds().shape(), config());
-    let mut fit = FilterFit::new(dimensions, shape, &config);
+    let mut fit = FilterFit::new(dimensions, worlds().shape(), &config());
+    see_frames(&mut fit);
+    fit.contents()
+}
+
+/// Fits a filter to some frames. Learning may fail, because finite numbers can overflow.
+fn see_frames(fit: &mut FilterFit) {
+    let shape = worlds().shape();
     let belief = Belief::uniform(2, shape);
     fit.begin(0);
     for value in [0, 1, 1, 0, 1] {
@@ -219,34 +209,21 @@ fn filter(dimensions: Dimensions) -> Contents {
         let learned = fit.learned();
         fit.see(0, &frame, Some(&belief), &learned);
         fit.earn(&belief, &[0, 2], 0.5);
-        fit.learn().expect("finite");
+        if fit.learn().is_err() {
+            return;
+        }
     }
-    let tensors = fit.named_tensors();
-    let state = SavedFilter {
-        fit,
-        worlds: BTreeMap::new(),
-    };
-    Contents::new(tensors, &state)
 }
 
 /// Returns the checkpoint of an autoencoder of this size, without its weights.
 fn autoencoder(side: usize, length: usize) -> Contents {
-    let cell = Shape::new(1, 1).expect("a grid");
     let state = SavedNetwork {
         shape: Shape::new(side, side).expect("a grid"),
         n_observations: 3,
         counters: [0, 0],
-        dqn: dqn().saved(),
-        frames: Vec::new(),
-        tracks: Vec::new(),
-        position: Position {
-            follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
-            estimate: None,
-            track: dqn().track(),
-            reward: RewardEstimate::new(3),
-            iterations: 0,
-            place: None,
-        },
+        n_dqn_updates: 0,
+        reward: RewardEstimate::new(3),
+        iterations: 0,
     };
     let settings = format!("[autoencoder]\nencoding = {length}\nhidden = {length}\n");
     Contents {

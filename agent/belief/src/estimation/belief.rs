@@ -15,8 +15,7 @@ use thiserror::Error;
 const SUM_TOLERANCE: f32 = 5e-5;
 
 /// One distribution over states per cell, shape `[S, H, W]`. The probabilities of each cell sum to one.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Probabilities", into = "Probabilities")]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Belief {
     probabilities: Probabilities,
     shape: Shape,
@@ -215,20 +214,6 @@ impl Belief {
             probabilities,
             shape,
         }
-    }
-}
-
-impl TryFrom<Probabilities> for Belief {
-    type Error = BeliefError;
-
-    fn try_from(probabilities: Probabilities) -> Result<Self, BeliefError> {
-        Self::from_probabilities(probabilities)
-    }
-}
-
-impl From<Belief> for Probabilities {
-    fn from(belief: Belief) -> Self {
-        belief.probabilities
     }
 }
 

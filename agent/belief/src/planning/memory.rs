@@ -1,7 +1,6 @@
 //! A robot's memory in addition to its belief: the age of each cell's last observation, and the rewards of its paths.
 
 use emberwatch_model::{Frame, Grid, Shape};
-use serde::{Deserialize, Serialize};
 
 /// Number of steps in which the freshness of a cell decays to `1/e`.
 const FADING_STEPS: f32 = 300.0;
@@ -10,7 +9,7 @@ const FADING_STEPS: f32 = 300.0;
 const LATEST_SHARE: f32 = 0.2;
 
 /// The freshness of each cell, and recent rewards.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Memory {
     /// `exp(-age / 300)` of each cell, where `age` is the number of steps since the cell was last seen. 0 if it was
     /// never seen.
@@ -19,7 +18,7 @@ pub struct Memory {
 }
 
 /// The rewards of a robot's recent paths.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Recent {
     /// Reward per move of the last path.
     pub last_reward: f32,

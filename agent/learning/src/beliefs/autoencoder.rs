@@ -1,7 +1,7 @@
 //! The autoencoder as an estimator: frames update a hidden vector (paper eq. 9), and Bayes' rule corrects visited cells
 //! (eq. 10).
 
-pub use super::follower::Follower;
+use super::follower::Follower;
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
 use super::learned::LEARNED;
@@ -93,23 +93,19 @@ pub struct AutoencoderEstimator {
 impl AutoencoderEstimator {
     /// Creates the estimator before its first frame.
     pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
-        Ok(Self::at(network, Follower::new(network)?))
-    }
-
-    /// Creates an estimator that continues from a recurrent state of the network.
-    pub fn at(network: &Autoencoder, follower: Follower) -> Self {
-        Self {
+        let follower = Follower::new(network)?;
+        Ok(Self {
             network: network.clone(),
-            belief: follower.prediction().clone(),
+            belief: follower.prediction.clone(),
             follower,
-        }
+        })
     }
 }
 
 impl Estimator for AutoencoderEstimator {
     /// Applies Bayes' rule with the learned `O` at visited cells (eq. 10). Other cells keep the predictor.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
-        let mut estimate = self.follower.prediction().clone();
+        let mut estimate = self.follower.prediction.clone();
         let likelihood = likelihood(&self.network).map_err(failed)?;
         correct(&mut estimate, &likelihood, frame)?;
         self.follower = self.follower.after(&self.network, frame).map_err(failed)?;
@@ -118,7 +114,7 @@ impl Estimator for AutoencoderEstimator {
     }
 
     fn predict(&mut self) {
-        self.belief.clone_from(self.follower.prediction());
+        self.belief.clone_from(&self.follower.prediction);
     }
 
     fn belief(&self) -> &Belief {
@@ -130,7 +126,7 @@ impl Estimator for AutoencoderEstimator {
     }
 
     fn hidden(&self) -> Option<&[f32]> {
-        Some(self.follower.hidden())
+        Some(&self.follower.hidden)
     }
 }
 

@@ -3,10 +3,9 @@
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Frame, Probabilities};
 use emberwatch_network::{Autoencoder, NetworkError, Window};
-use serde::{Deserialize, Serialize};
 
 /// The recurrent state of a network in one world. All methods must receive the same network.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone)]
 pub struct Follower {
     /// The hidden vector `h_k`.
     pub hidden: Vec<f32>,
@@ -22,23 +21,11 @@ impl Follower {
         Ok(Self { hidden, prediction })
     }
 
-    pub fn at(hidden: Vec<f32>, prediction: Belief) -> Self {
-        Self { hidden, prediction }
-    }
-
     /// Returns the state after a frame (eq. 9).
     pub fn after(&self, network: &Autoencoder, frame: &Frame) -> Result<Self, NetworkError> {
         let hidden = network.advance(&Window::new([frame]), &self.hidden)?;
         let prediction = accepted(network.predict(&hidden)?);
         Ok(Self { hidden, prediction })
-    }
-
-    pub fn hidden(&self) -> &[f32] {
-        &self.hidden
-    }
-
-    pub fn prediction(&self) -> &Belief {
-        &self.prediction
     }
 }
 

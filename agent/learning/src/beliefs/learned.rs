@@ -147,7 +147,7 @@ pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] 
 /// Loads parameters or moments with the given dimensions. Their names are [`Parameters::NAMES`] with a suffix.
 ///
 /// # Errors
-/// If a dimension is out of range, a tensor is missing or has another form, or the filter has several kernels.
+/// If a dimension is out of range, or a tensor is missing or has another form.
 pub fn read_parameters(
     dimensions: Dimensions,
     part: &Part<'_>,
@@ -156,9 +156,6 @@ pub fn read_parameters(
     let checked = dimensions.check();
     checked.map_err(|error| wrong("dimensions", "valid dimensions of a filter", error))?;
     let names = Parameters::NAMES.map(|name| format!("{name}{suffix}"));
-    let is_one = part.shape(&names[0]).is_none_or(|shape| shape.len() == 4);
-    let got = "kernels by own state or zone: train the filter again";
-    check(is_one, &names[0], "one kernel for all cells", got)?;
     let shapes = dimensions.shapes();
     let tensor = |at: usize| part.tensor(&names[at], &shapes[at]);
     Ok(Parameters {

@@ -132,32 +132,10 @@ pub fn estimator(
     Ok(NeuralEstimator::new(network, filter, shape)?)
 }
 
-/// Creates a network with initial parameters, which a checkpoint then replaces.
-///
-/// # Errors
-/// If the number of observations is out of range.
-pub fn new_network(n_observations: usize, device: &Device) -> Result<NeuralBelief> {
-    let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
-    let fits = fits.contains(&n_observations);
-    check(fits, "n_observations", expected, n_observations)?;
-    Ok(NeuralBelief::new(n_observations, 0, device)?)
-}
-
 /// Returns the tensors of a corrected filter, with the prefix `filter.`.
 pub fn corrected_tensors(filter: &LearnedModel) -> impl Iterator<Item = NamedTensor> + use<> {
     let named = |(name, shape, numbers)| (format!("{FILTER}{name}"), shape, numbers);
     filter.tensors().into_iter().map(named)
-}
-
-/// Loads a corrected filter, and checks its number of observations.
-pub fn read_corrected(
-    saved: &SavedModel,
-    n_observations: usize,
-    part: &Part<'_>,
-) -> Result<LearnedModel> {
-    let (name, got) = ("filter.n_observations", saved.n_observations());
-    check(got == n_observations, name, n_observations, got)?;
-    saved.read(&part.part(FILTER))
 }
 
 /// The part of a [`NeuralModel`] that a checkpoint stores besides the tensors.
@@ -180,18 +158,35 @@ impl SavedNeuralModel {
         }
     }
 
+    /// Returns the number of observations.
+    pub fn n_observations(&self) -> usize {
+        self.n_observations
+    }
+
     /// Loads the model, with its tensors from a part of a checkpoint. The network computes on `device`.
     pub fn read(&self, part: &Part<'_>, device: &Device) -> Result<NeuralModel> {
-        check_target(self.target, self.n_observations)?;
-        let mut network = new_network(self.n_observations, device)?;
+        let n_observations = self.n_observations;
+        let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
+        let fits = fits.contains(&n_observations);
+        check(fits, "n_observations", expected, n_observations)?;
+        check_target(self.target, n_observations)?;
+        let mut network = NeuralBelief::new(n_observations, 0, device)?;
         network.set_parameters(|name: &str, shape: &[usize]| part.tensor(name, shape))?;
-        let filter = self.filter.as_ref();
-        let filter = filter.map(|it| read_corrected(it, self.n_observations, part));
         Ok(NeuralModel {
             network,
-            filter: filter.transpose()?.map(Box::new),
+            filter: self.read_filter(part)?,
             target: self.target,
         })
+    }
+
+    /// Loads the corrected filter, if there is one.
+    pub fn read_filter(&self, part: &Part<'_>) -> Result<Option<Box<LearnedModel>>> {
+        let Some(filter) = &self.filter else {
+            return Ok(None);
+        };
+        let (expected, got) = (self.n_observations, filter.n_observations());
+        check(got == expected, "filter.n_observations", expected, got)?;
+        Ok(Some(Box::new(filter.read(&part.part(FILTER))?)))
     }
 }
 

@@ -10,7 +10,7 @@ fn state() -> State {
 fn contents() -> Contents {
     let kernel = ("kernel".into(), vec![2, 2], vec![1.0, -0.5, 0.0, 3e-9]);
     let mut contents = Contents::new([kernel], &state());
-    contents.settings = "seed = 3\nkernels = \"neighbours\"".into();
+    contents.settings = "seed = 3".into();
     contents
 }
 
@@ -96,14 +96,14 @@ fn errors_name_the_kind_format_tensor_or_state() {
             "kind: expected the name of a learner, got none",
         ),
         (
-            r#"format":"4""#,
+            r#"format":"6""#,
             r#"format":"9""#,
-            "format: expected 4, got 9",
+            "format: expected 6, got 9, of another release: train it again",
         ),
         (
-            r#"format":"4""#,
-            r#"formar":"4""#,
-            "format: expected 4, got none",
+            r#"format":"6""#,
+            r#"formar":"6""#,
+            "format: expected 6, got none, of another release: train it again",
         ),
     ] {
         let mut words_at = whole.windows(from.len());

@@ -1,12 +1,11 @@
 //! Adam (Kingma and Ba, 2015, algorithm 1) for the filter's three tensors.
 
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
-use serde::{Deserialize, Serialize};
 
 /// A constant added to the square root of the second moment, as in the Adam paper.
 const EPSILON: f64 = 1e-8;
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Adam {
     pub first: Parameters,
     pub second: Parameters,

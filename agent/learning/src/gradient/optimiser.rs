@@ -5,7 +5,6 @@
 //! window starts from a belief that depends on the earlier frames, but gradients reach back only to the start of the
 //! window.
 
-use crate::checkpoint::{check, check_counts, check_numbers};
 use crate::config::LearningConfig;
 use crate::gradient::adam::Adam;
 use crate::replay::{Block, BlockReplay};
@@ -16,25 +15,23 @@ use emberwatch_model::Shape;
 use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 /// Number of groups of streams. Each group has its own buffers, so more threads than groups are useless. Groups and the
 /// order of summation do not depend on the number of threads.
 const N_PARTS: usize = 8;
 
 /// The parameters, and everything else that a later update depends on, except the replay buffer.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone)]
 pub struct Optimiser {
     parameters: Parameters,
     pub adam: Adam,
     config: LearningConfig,
     seed: u64,
     pub shape: Shape,
-    pub(crate) streams: Vec<Stream>,
+    streams: Vec<Stream>,
     /// Blocks that remain in this lap. A lap is one pass through all blocks in random order.
     lap: Vec<u64>,
     n_laps: u64,
-    #[serde(skip)]
     recursions: Vec<Recursion>,
 }
 
@@ -47,13 +44,12 @@ pub struct Update {
 }
 
 /// A stream: its position in the replay buffer, and its belief before the next frame.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Stream {
+#[derive(Debug, Clone, PartialEq)]
+struct Stream {
     block: Option<u64>,
     n_done: usize,
     belief: Vec<f32>,
     /// Buffer for the belief after the next window.
-    #[serde(skip)]
     end: Vec<f32>,
 }
 
@@ -81,43 +77,10 @@ impl Optimiser {
         }
     }
 
-    /// Resumes with the parameters and moments of another optimiser. Also resumes its streams, if [`Self::cut`] is the
-    /// same for both.
-    ///
-    /// # Errors
-    /// If the saved streams are invalid.
-    pub fn resume(&mut self, other: Self) -> Result<()> {
-        if self.cut() == other.cut() {
-            self.resume_streams(other.streams)?;
-            check_counts(&[("n_laps", other.n_laps)])?;
-            (self.lap, self.n_laps) = (other.lap, other.n_laps);
-        } else {
-            self.n_laps = other.adam.n_steps;
-        }
-        (self.parameters, self.adam) = (other.parameters, other.adam);
-        Ok(())
-    }
-
-    fn resume_streams(&mut self, mut streams: Vec<Stream>) -> Result<()> {
-        let (expected, got) = (self.streams.len(), streams.len());
-        check(got == expected, "streams", expected, got)?;
-        let length = self.dimensions().n_states * self.shape.n_cells();
-        for stream in &mut streams {
-            let (most, got) = (self.config.block_windows, stream.n_done);
-            let expected = format!("at most {most} windows of a block");
-            check(got <= most, "streams.n_done", expected, got)?;
-            check_numbers("streams.belief", &stream.belief, length)?;
-            stream.end = vec![0.0; length];
-        }
-        self.streams = streams;
-        Ok(())
-    }
-
-    /// Returns the settings that positions in the replay buffer depend on: grid, window, windows per block, streams.
-    pub fn cut(&self) -> (Shape, [usize; 3]) {
-        let config = &self.config;
-        let cut = [config.window, config.block_windows, config.streams];
-        (self.shape, cut)
+    /// Continues from parameters and moments. Orders of blocks differ from those before.
+    pub fn resume(&mut self, parameters: Parameters, adam: Adam) {
+        self.n_laps = adam.n_steps;
+        (self.parameters, self.adam) = (parameters, adam);
     }
 
     pub fn config(&self) -> &LearningConfig {
@@ -126,10 +89,6 @@ impl Optimiser {
 
     pub fn parameters(&self) -> &Parameters {
         &self.parameters
-    }
-
-    pub fn set_parameters(&mut self, parameters: Parameters) {
-        self.parameters = parameters;
     }
 
     pub fn dimensions(&self) -> Dimensions {
@@ -172,14 +131,6 @@ impl Optimiser {
         }
         let loss = -log_likelihood / n_seen as f64;
         self.step(loss, &gradient).map(Some)
-    }
-
-    /// Detaches the streams from their blocks. Call this when the replay buffer is replaced.
-    pub fn leave_replay(&mut self) {
-        self.lap.clear();
-        self.streams
-            .iter_mut()
-            .for_each(|stream| stream.block = None);
     }
 
     /// Assigns a new block to each stream whose block is finished or was dropped.

@@ -120,17 +120,14 @@ impl Worlds {
     }
 }
 
-/// A robot's position in time and space: the world's seed, episode, step k, then row and column.
-pub type Place = [u64; 5];
-
-/// An actor that learns from the observations of its robots.
-pub trait Learning: Actor {
+/// A learner for `train`: an actor that learns from the observations of its robots.
+pub trait Learner: Actor {
     /// Whether the next frames should show every cell, if the server permits it.
     fn wants_full_frames(&self) -> bool {
         false
     }
 
-    /// Begins a robot's next episode.
+    /// Begins a robot's next episode. The first episodes begin in the order of the robots.
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()>;
 
     /// Makes the updates that are due after the steps since the last call.
@@ -149,30 +146,24 @@ pub trait Learning: Actor {
 
     /// Explains why a run with this number of steps made no update, and what to do.
     fn lacks(&self, steps: u64) -> String;
-}
 
-/// A learner that can be saved and resumed.
-pub trait Saving {
-    /// Attaches the learner to its robots, given their current observations. Returns the number of robots that continue
-    /// from the checkpoint.
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
-
-    /// Returns the contents of a checkpoint from which a later run can resume.
+    /// Returns what was learned, for a checkpoint from which a later run can resume.
     fn contents(&self) -> Result<Contents>;
 }
-
-/// A learner for `train`: it acts, learns, and can be saved.
-pub trait Learner: Learning + Saving {}
-
-impl<L: Learning + Saving> Learner for L {}
 
 /// Explains that a run was too short for an update. `name` is the name of the setting for updates per step.
 pub(super) fn lacks_steps(name: &str, updates_per_step: f64) -> String {
     format!("too few for an update at {name} = {updates_per_step}; train for more --steps")
 }
 
-pub(super) fn place(observation: &Observation) -> Place {
-    let (world, robot) = (&observation.world, &observation.robot);
-    let [row, col] = [robot.row, robot.col].map(u64::from);
-    [world.seed, world.episode, world.step, row, col]
+/// Puts a robot's run in its place, and returns the run of its last episode.
+pub(super) fn replace<R>(runs: &mut Vec<R>, worlds: &Worlds, robot: u32, run: R) -> Option<R> {
+    let index = (robot - worlds.numbers.start) as usize;
+    match runs.get_mut(index) {
+        Some(last) => Some(std::mem::replace(last, run)),
+        None => {
+            runs.push(run);
+            None
+        }
+    }
 }

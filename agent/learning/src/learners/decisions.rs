@@ -8,13 +8,11 @@ mod saved;
 pub use self::base::{Base, belief_of};
 pub use self::saved::{SHAPE, SavedDecisions};
 
-use self::run::{Run, features};
-use self::saved::{Held, SavedBelief, SavedRun};
+use self::run::{Held, Run, features};
+use self::saved::SavedBelief;
 use crate::checkpoint::{Contents, check};
 use crate::config::AgentConfig;
-use crate::learners::base::{
-    Beginning, Learner, LearnerKind, Learning, Saving, Worlds, lacks_steps,
-};
+use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, lacks_steps, replace};
 use crate::learners::update::ModelUpdate;
 use crate::parallel::in_parallel;
 use crate::policy::Policy;
@@ -26,7 +24,6 @@ use emberwatch_model::Move;
 use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_network::Dqn;
 use rand_chacha::rand_core::Rng;
-use std::collections::BTreeMap;
 
 pub const DECISIONS: LearnerKind = LearnerKind {
     name: "decisions",
@@ -62,10 +59,8 @@ pub struct DecisionsLearner {
     config: AgentConfig,
     base: Base,
     policy: Policy,
-    dqn: Dqn,
+    pub(super) dqn: Dqn,
     runs: Vec<Run>,
-    /// The saved run of each world, kept until the learner is attached to its robots.
-    saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
     /// Number of updates that are due but not made yet.
     earned: f64,
@@ -84,7 +79,6 @@ impl DecisionsLearner {
             base,
             dqn: Dqn::new(config.decisions.settings(), SHAPE, config.seed),
             runs: Vec::new(),
-            saved_runs: BTreeMap::new(),
             world_steps: 0,
             earned: 0.0,
             worlds,
@@ -102,14 +96,6 @@ impl DecisionsLearner {
         let (config, policy) = (&self.config, (&self.policy, self.base.target));
         let (estimator, worlds) = (base.estimator()?, &self.worlds);
         Ok(worlds.rollout(config, policy, estimator, names, observation))
-    }
-
-    /// Begins a robot's run with the first observation of an episode.
-    fn begun(&self, observation: Observation) -> Result<Run> {
-        let mut rollout = self.rollout_at(observation)?;
-        rollout.correct()?;
-        rollout.agent.predict();
-        Ok(Run::begun(rollout, &self.dqn))
     }
 
     /// Chooses the option that a robot flies: the option with the highest value, or a random option that it keeps for
@@ -155,24 +141,6 @@ impl DecisionsLearner {
         (1.0 - done).max(config.final_rate)
     }
 
-    fn saved(&self) -> Result<Contents> {
-        let runs = self.runs.iter().map(Run::saved);
-        let belief = SavedBelief::of(self.base.kind, &self.base.learned)?;
-        let (belief, of_belief) =
-            belief.map_or((None, Vec::new()), |(it, tensors)| (Some(it), tensors));
-        let state = SavedDecisions {
-            options: OPTIONS.map(|option| option.name.into()).into(),
-            estimator: self.base.kind.name.into(),
-            belief,
-            world_steps: self.world_steps,
-            earned: self.earned,
-            dqn: self.dqn.saved(),
-            worlds: self.worlds.numbers.clone().zip(runs).collect(),
-        };
-        let tensors = self.dqn.named_tensors().into_iter().chain(of_belief);
-        Ok(Contents::new(tensors, &state))
-    }
-
     /// Loads a checkpoint of decisions on the same kind of belief.
     fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedDecisions = contents.state()?;
@@ -180,11 +148,7 @@ impl DecisionsLearner {
         let [expected, got] = [self.base.kind, saved.kind()?].map(|kind| kind.name);
         check(got == expected, "decisions.estimator", expected, got)?;
         self.world_steps = saved.world_steps;
-        self.earned = saved.earned;
-        self.saved_runs = saved.worlds;
-        let n_states = self.base.state_names.len();
-        let mut saved_runs = self.saved_runs.values();
-        saved_runs.try_for_each(|run| run.check(n_states, self.worlds.shape()))
+        Ok(())
     }
 }
 
@@ -214,13 +178,16 @@ impl Actor for DecisionsLearner {
     }
 }
 
-impl Learning for DecisionsLearner {
+impl Learner for DecisionsLearner {
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let begun = self.begun(observation)?;
-        let run = &mut self.runs[(robot - self.worlds.numbers.start) as usize];
-        let mut ended = std::mem::replace(run, begun);
-        let transitions = ended.end(&self.dqn).into_iter();
-        transitions.for_each(|transition| self.dqn.remember(transition));
+        let mut rollout = self.rollout_at(observation)?;
+        rollout.correct()?;
+        rollout.agent.predict();
+        let run = Run::begun(rollout, &self.dqn);
+        if let Some(mut ended) = replace(&mut self.runs, &self.worlds, robot, run) {
+            let transitions = ended.end(&self.dqn).into_iter();
+            transitions.for_each(|transition| self.dqn.remember(transition));
+        }
         Ok(())
     }
 
@@ -261,7 +228,7 @@ impl Learning for DecisionsLearner {
     }
 
     fn lacks(&self, _: u64) -> String {
-        let (batch, n) = (self.dqn.settings().batch, self.dqn.n_remembered());
+        let (batch, n) = (self.dqn.settings().batch, self.dqn.remembered().len());
         if n < batch {
             return format!(
                 "an update learns from {batch} transitions, and the steps yielded {n}; train for more --steps, or with \
@@ -271,26 +238,19 @@ impl Learning for DecisionsLearner {
         let rate = self.config.decisions.updates_per_step;
         lacks_steps("decisions.updates_per_step", rate)
     }
-}
-
-impl Saving for DecisionsLearner {
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let mut n_resumed = 0;
-        for (world, observation) in self.worlds.numbers.clone().zip(observations) {
-            let saved = self.saved_runs.remove(&world);
-            let run = match saved.filter(|run| run.resume_point.is_of(&observation)) {
-                Some(saved) => {
-                    n_resumed += 1;
-                    Run::restore(saved, self.rollout_at(observation)?, &self.dqn)?
-                }
-                None => self.begun(observation)?,
-            };
-            self.runs.push(run);
-        }
-        Ok(n_resumed)
-    }
 
     fn contents(&self) -> Result<Contents> {
-        self.saved()
+        let belief = SavedBelief::of(self.base.kind, &self.base.learned)?;
+        let (belief, of_belief) =
+            belief.map_or((None, Vec::new()), |(it, tensors)| (Some(it), tensors));
+        let state = SavedDecisions {
+            options: OPTIONS.map(|option| option.name.into()).into(),
+            estimator: self.base.kind.name.into(),
+            belief,
+            n_updates: self.n_updates(),
+            world_steps: self.world_steps,
+        };
+        let tensors = self.dqn.named_tensors().into_iter().chain(of_belief);
+        Ok(Contents::new(tensors, &state))
     }
 }

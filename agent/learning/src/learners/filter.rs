@@ -6,12 +6,11 @@ mod saved;
 
 pub use self::saved::SavedFilter;
 
-use self::saved::SavedRobot;
 use crate::beliefs::learned::LearnedModel;
 use crate::beliefs::{LEARNED, numbered_states};
 use crate::checkpoint::Contents;
 use crate::config::AgentConfig;
-use crate::learners::base::{Beginning, Learner, LearnerKind, Learning, Saving, Worlds};
+use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, replace};
 use crate::learners::filter::fit::FilterFit;
 use crate::learners::update::ModelUpdate;
 use crate::parallel::in_parallel;
@@ -25,7 +24,6 @@ use emberwatch_belief::planning::Plan;
 use emberwatch_messages::control::CoverageRule;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
-use std::collections::BTreeMap;
 
 pub struct FilterLearner {
     worlds: Worlds,
@@ -35,8 +33,6 @@ pub struct FilterLearner {
     rollouts: Vec<Rollout>,
     /// The last plan of each robot, with the belief that it was based on.
     planned: Vec<(Belief, Plan)>,
-    /// The saved state of each robot, by robot number.
-    saved_robots: BTreeMap<u32, SavedRobot>,
 }
 
 pub const FILTER: LearnerKind = LearnerKind {
@@ -47,17 +43,15 @@ pub const FILTER: LearnerKind = LearnerKind {
     is_single: false,
     steps: |_| 0,
     episode_steps: |_| None,
-    done: |contents| Ok(contents.state::<SavedFilter>()?.fit.world_steps),
+    done: |contents| Ok(contents.state::<SavedFilter>()?.world_steps),
     adopt: |contents, config| {
         if let Ok(settings) = contents.settings() {
             config.full_frames = settings.full_frames;
         }
     },
     read: |contents, _, learned| {
-        let mut fit = contents.state::<SavedFilter>()?.fit;
-        let dimensions = fit.optimiser.dimensions();
-        fit.load(contents, dimensions)?;
-        Ok(learned.put(fit.learned()))
+        let model = contents.state::<SavedFilter>()?.model;
+        Ok(learned.put(model.read(&contents.part(""))?))
     },
     begin,
 };
@@ -68,10 +62,8 @@ fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
         !on.config.full_frames || on.info.coverage != CoverageRule::Path,
         "full_frames: expected a server with --coverage client or full, got path"
     );
-    Ok(Box::new(match on.contents {
-        Some(contents) => FilterLearner::resume(contents, dimensions, on.worlds, on.config)?,
-        None => FilterLearner::new(dimensions, on.worlds, on.config),
-    }))
+    let learner = FilterLearner::new(on.contents, dimensions, on.worlds, on.config);
+    Ok(Box::new(learner?))
 }
 
 fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
@@ -88,47 +80,23 @@ fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
 }
 
 impl FilterLearner {
-    /// Creates a learner before its first frame.
-    pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
-        let fit = FilterFit::new(dimensions, worlds.shape(), config);
-        Self::of(fit, BTreeMap::new(), worlds, config)
-    }
-
-    pub fn resume(
-        contents: &Contents,
+    /// Creates a learner, or resumes one from a checkpoint.
+    pub fn new(
+        contents: Option<&Contents>,
         dimensions: Dimensions,
         worlds: Worlds,
         config: &AgentConfig,
     ) -> Result<Self> {
-        let SavedFilter {
-            fit,
-            worlds: mut saved_robots,
-        } = contents.state()?;
-        let shape = fit.optimiser.shape;
-        let fit = FilterFit::resume(fit, contents, dimensions, worlds.shape(), config)?;
-        let mut all = saved_robots.values();
-        all.try_for_each(|robot| robot.check(dimensions.n_states, shape))?;
-        if shape != worlds.shape() {
-            saved_robots.clear();
-        }
-        Ok(Self::of(fit, saved_robots, worlds, config))
-    }
-
-    fn of(
-        fit: FilterFit,
-        saved_robots: BTreeMap<u32, SavedRobot>,
-        worlds: Worlds,
-        config: &AgentConfig,
-    ) -> Self {
-        Self {
+        let mut fit = FilterFit::new(dimensions, worlds.shape(), config);
+        contents.map_or(Ok(()), |contents| fit.load(contents))?;
+        Ok(Self {
             learned: fit.learned(),
             fit,
-            saved_robots,
             worlds,
             config: config.clone(),
             rollouts: Vec::new(),
             planned: Vec::new(),
-        }
+        })
     }
 
     /// Creates a robot's rollout, whose belief has not been corrected yet.
@@ -145,17 +113,6 @@ impl FilterLearner {
             names,
             observation,
         )
-    }
-
-    /// Begins a robot's track and its rollout with the first observation of an episode.
-    fn begun(&mut self, robot: u32, observation: Observation) -> Result<Rollout> {
-        self.fit.begin(robot);
-        let frame = &observation.frame;
-        self.fit.see(robot, frame, None, &self.learned);
-        let mut rollout = self.rollout_at(observation);
-        rollout.correct()?;
-        rollout.agent.predict();
-        Ok(rollout)
     }
 
     /// Returns the number of worlds whose robots move at random: first all, later a share.
@@ -212,14 +169,18 @@ impl Actor for FilterLearner {
     }
 }
 
-impl Learning for FilterLearner {
+impl Learner for FilterLearner {
     fn wants_full_frames(&self) -> bool {
         self.config.full_frames
     }
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let rollout = self.begun(robot, observation)?;
-        self.rollouts[(robot - self.worlds.numbers.start) as usize] = rollout;
+        self.fit.begin(robot);
+        self.fit.see(robot, &observation.frame, None, &self.learned);
+        let mut rollout = self.rollout_at(observation);
+        rollout.correct()?;
+        rollout.agent.predict();
+        replace(&mut self.rollouts, &self.worlds, robot, rollout);
         Ok(())
     }
 
@@ -252,38 +213,8 @@ impl Learning for FilterLearner {
     fn lacks(&self, steps: u64) -> String {
         self.fit.lacks(steps)
     }
-}
-
-impl Saving for FilterLearner {
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let robots = self.worlds.numbers.clone();
-        let mut n_resumed = 0;
-        if !SavedRobot::any_is_of(&self.saved_robots, robots.clone(), &observations) {
-            // The saved frames come from other worlds, which may have another model.
-            self.fit.forget();
-        }
-        for (robot, observation) in robots.zip(observations) {
-            let saved = self.saved_robots.get(&robot);
-            let saved =
-                saved.filter(|saved| saved.is_of(&observation) && self.fit.has_track(robot));
-            let rollout = if let Some(saved) = saved {
-                let mut rollout = self.rollout_at(observation);
-                saved.restore(&mut rollout.agent);
-                n_resumed += 1;
-                rollout
-            } else {
-                self.begun(robot, observation)?
-            };
-            self.rollouts.push(rollout);
-        }
-        Ok(n_resumed)
-    }
 
     fn contents(&self) -> Result<Contents> {
-        let saved = self.rollouts.iter().map(SavedRobot::of);
-        let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(saved).collect();
-        // Encoded like `SavedFilter`, but without cloning the learner.
-        let state = (&self.fit, worlds);
-        Ok(Contents::new(self.fit.named_tensors(), &state))
+        Ok(self.fit.contents())
     }
 }

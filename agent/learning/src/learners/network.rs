@@ -7,24 +7,23 @@
 
 mod progress;
 
-pub use self::progress::{Position, Progress, SavedNetwork};
+pub use self::progress::{Progress, SavedNetwork};
 
-use self::progress::follower;
 use anyhow::{Result, ensure};
 use emberwatch_messages::control::{CoverageRule, ServerInfo};
 
-use crate::beliefs::autoencoder::{AutoencoderEstimator, Follower};
+use crate::beliefs::autoencoder::AutoencoderEstimator;
 use crate::beliefs::numbered_states;
 use crate::checkpoint::Contents;
 use crate::config::AgentConfig;
-use crate::learners::base::{Beginning, Learner, LearnerKind, Learning, Saving, Worlds, place};
+use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds};
 use crate::learners::update::ModelUpdate;
 use crate::policy::{Policy, network_choices};
 use crate::reward::met;
 use crate::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
-use emberwatch_network::{Transition, Window};
+use emberwatch_network::{FrameReplay, Track, Transition, Window};
 
 pub const AUTOENCODER: LearnerKind = LearnerKind {
     name: "autoencoder",
@@ -34,7 +33,7 @@ pub const AUTOENCODER: LearnerKind = LearnerKind {
     is_single: true,
     steps: |_| 0,
     episode_steps: |_| None,
-    done: |contents| Ok(contents.state::<SavedNetwork>()?.position.iterations),
+    done: |contents| Ok(contents.state::<SavedNetwork>()?.iterations),
     adopt: |_, _| {},
     read: |contents, device, learned| {
         Ok(learned.put(Progress::read(contents, device)?.into_model()))
@@ -43,7 +42,7 @@ pub const AUTOENCODER: LearnerKind = LearnerKind {
 };
 
 fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
-    let mut progress = Progress::first(&on.worlds, on.config, on.device)?;
+    let mut progress = Progress::first(&on.worlds.form(), on.config, on.device)?;
     if let Some(contents) = on.contents {
         progress.load(contents)?;
     }
@@ -58,7 +57,7 @@ fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
 fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInfo) -> Result<()> {
     let full_frames = config.autoencoder.full_frames;
     ensure!(
-        progress.position.iterations >= full_frames || info.coverage != CoverageRule::Path,
+        progress.iterations >= full_frames || info.coverage != CoverageRule::Path,
         "autoencoder.full_frames: {full_frames} frames that show every cell need a server with --coverage client or \
          full; set it to 0 for other servers"
     );
@@ -87,7 +86,11 @@ fn check_window(config: &AgentConfig, info: &ServerInfo) -> Result<()> {
 pub struct NetworkLearner {
     worlds: Worlds,
     config: AgentConfig,
-    progress: Progress,
+    pub(super) progress: Progress,
+    /// The frames for training.
+    replay: FrameReplay,
+    /// The latest steps, whose transitions are not yet in the DQN's replay buffer.
+    track: Track,
     choices: Vec<Policy>,
     /// The rollout, once attached to a world.
     rollout: Option<Rollout>,
@@ -108,23 +111,14 @@ impl NetworkLearner {
     pub fn new(progress: Progress, worlds: Worlds, config: &AgentConfig) -> Self {
         Self {
             choices: network_choices(progress.autoencoder.shape().n_states),
+            replay: FrameReplay::new(config.autoencoder.settings().replay),
+            track: progress.dqn.track(),
             progress,
             worlds,
             config: config.clone(),
             rollout: None,
             decision: None,
         }
-    }
-
-    /// Creates a rollout that continues from the autoencoder's recurrent state. Its belief has not been corrected with
-    /// the observation yet.
-    fn rollout_at(&self, follower: Follower, observation: Observation) -> Rollout {
-        let network = &self.progress.autoencoder;
-        let estimator = AutoencoderEstimator::at(network, follower);
-        let names = numbered_states(network.shape().n_states);
-        // The initial policy is the first choice, whose target is the first state.
-        let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
-        worlds.rollout(&self.config, first, Box::new(estimator), names, observation)
     }
 
     fn at_world(&self) -> &Rollout {
@@ -139,12 +133,14 @@ impl NetworkLearner {
 
     /// Returns the input of the next action: `h_{k+1}`, which depends on the last frame.
     fn input(&self) -> Vec<f32> {
-        follower(self.at_world()).hidden
+        let hidden = self.at_world().agent.estimator().hidden();
+        let hidden = hidden.expect("invariant: its estimator is an autoencoder");
+        hidden.to_vec()
     }
 
     fn decide(&self) -> Decision {
         let (dqn, input) = (&self.progress.dqn, self.input());
-        let action = dqn.act(&input, self.progress.position.iterations);
+        let action = dqn.act(&input, self.progress.iterations);
         Decision {
             value: dqn.values(&input)[action],
             input,
@@ -166,23 +162,18 @@ impl NetworkLearner {
             next: self.input(),
             discount: self.progress.dqn.discount(world.terminated != 0),
         };
-        let Progress { position, dqn, .. } = &mut self.progress;
-        let full = position.track.add(step);
+        let full = self.track.add(step);
         let short = if is_over {
-            position.track.end()
+            self.track.end()
         } else {
             Vec::new()
         };
         let transitions = full.into_iter().chain(short);
-        transitions.for_each(|transition| dqn.remember(transition));
+        transitions.for_each(|transition| self.progress.dqn.remember(transition));
     }
 
     fn update_dqn(&mut self) -> Result<[Option<f64>; 2]> {
-        let rate = self
-            .config
-            .dqn
-            .step_size
-            .at(self.progress.position.iterations);
+        let rate = self.config.dqn.step_size.at(self.progress.iterations);
         self.progress.dqn.set_learning_rate(rate as f32);
         let loss = self.progress.dqn.update();
         Ok([loss?.map(f64::from), Some(rate)])
@@ -191,13 +182,12 @@ impl NetworkLearner {
     fn update_autoencoder(&mut self) -> Result<[Option<f64>; 2]> {
         let number = self.progress.autoencoder.n_updates();
         let config = &self.config.autoencoder;
-        let replay = &self.progress.replay;
-        let window = replay.window(config.window, self.config.seed, number);
+        let window = self.replay.window(config.window, self.config.seed, number);
         let Some(window) = window.filter(Window::has_targets) else {
             return Ok([None; 2]);
         };
         // Like the DQN's step size, this one depends on the iteration, because eq. 20 compares the two.
-        let rate = config.step_size.at(self.progress.position.iterations);
+        let rate = config.step_size.at(self.progress.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
         let loss = self.progress.autoencoder.update(&window);
         Ok([Some(loss?), Some(rate)])
@@ -228,10 +218,9 @@ impl Actor for NetworkLearner {
         let flight = self.worlds.airspace.fly(start, path.unwrap_or_default());
         let met = met(rollout.agent.belief(), &flight.visited);
         let frame = rollout.observation().frame.clone();
-        let position = &mut self.progress.position;
-        position.reward.add(&met, record.reward);
-        position.iterations += 1;
-        self.progress.replay.push(frame);
+        self.progress.reward.add(&met, record.reward);
+        self.progress.iterations += 1;
+        self.replay.push(frame);
         Ok(records)
     }
 
@@ -241,17 +230,22 @@ impl Actor for NetworkLearner {
     }
 }
 
-impl Learning for NetworkLearner {
+impl Learner for NetworkLearner {
     fn wants_full_frames(&self) -> bool {
-        self.progress.position.iterations < self.config.autoencoder.full_frames
+        self.progress.iterations < self.config.autoencoder.full_frames
     }
 
     fn begin(&mut self, _: u32, observation: Observation) -> Result<()> {
-        self.progress.position.track = self.progress.dqn.track();
-        self.progress.replay.begin();
-        self.progress.replay.push(observation.frame.clone());
-        let follower = Follower::new(&self.progress.autoencoder)?;
-        let mut rollout = self.rollout_at(follower, observation);
+        self.track = self.progress.dqn.track();
+        self.replay.begin();
+        self.replay.push(observation.frame.clone());
+        let network = &self.progress.autoencoder;
+        let estimator = AutoencoderEstimator::new(network)?;
+        let names = numbered_states(network.shape().n_states);
+        // The initial policy is the first choice, whose target is the first state.
+        let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
+        let mut rollout =
+            worlds.rollout(&self.config, first, Box::new(estimator), names, observation);
         rollout.correct()?;
         rollout.agent.predict();
         self.rollout = Some(rollout);
@@ -263,7 +257,7 @@ impl Learning for NetworkLearner {
             .config
             .dqn
             .settings()
-            .epsilon_at(self.progress.position.iterations - 1);
+            .epsilon_at(self.progress.iterations - 1);
         let [dqn_loss, dqn_rate] = self.update_dqn()?;
         let [loss, rate] = self.update_autoencoder()?;
         let decision = self.decision.as_ref();
@@ -292,7 +286,7 @@ impl Learning for NetworkLearner {
     }
 
     fn world_steps(&self) -> u64 {
-        self.progress.position.iterations
+        self.progress.iterations
     }
 
     fn n_updates(&self) -> u64 {
@@ -307,27 +301,8 @@ impl Learning for NetworkLearner {
             self.config.autoencoder.window
         )
     }
-}
-
-impl Saving for NetworkLearner {
-    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize> {
-        let observation = observations.remove(0);
-        let shown = self.progress.replay.frames().last();
-        let resumes = self.progress.position.place == Some(place(&observation))
-            && shown == Some(&observation.frame);
-        if resumes {
-            let follower = self.progress.position.follower.clone();
-            let mut rollout = self.rollout_at(follower, observation);
-            let estimate = self.progress.position.estimate.as_ref();
-            rollout.agent.remember_estimate(estimate);
-            self.rollout = Some(rollout);
-        } else {
-            self.begin(self.worlds.numbers.start, observation)?;
-        }
-        Ok(usize::from(resumes))
-    }
 
     fn contents(&self) -> Result<Contents> {
-        Ok(self.progress.to_contents(self.at_world())?)
+        Ok(self.progress.contents()?)
     }
 }

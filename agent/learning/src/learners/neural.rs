@@ -11,16 +11,12 @@ pub use self::saved::SavedNeural;
 
 use self::behaviour::Behaviour;
 use self::replay::LessonReplay;
-use self::saved::SavedRun;
-use crate::beliefs::learned::{LearnedModel, SavedModel};
-use crate::beliefs::neural::{corrected_tensors, estimator};
+use crate::beliefs::learned::LearnedModel;
+use crate::beliefs::neural::{NeuralModel, SavedNeuralModel, corrected_tensors, estimator};
 use crate::beliefs::{LearnedBelief, NEURAL as BELIEF, numbered_states};
-use crate::checkpoint::{Contents, check};
+use crate::checkpoint::{Contents, check, check_counts};
 use crate::config::AgentConfig;
-use crate::learners::base::{
-    Beginning, Learner, LearnerKind, Learning, Saving, Worlds, lacks_steps,
-};
-use crate::learners::resume_point::ResumePoint;
+use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, lacks_steps, replace};
 use crate::learners::update::ModelUpdate;
 use crate::parallel::in_parallel;
 use crate::policy::Policy;
@@ -31,8 +27,6 @@ use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_network::{Device, NeuralBelief};
-use std::borrow::Cow;
-use std::collections::BTreeMap;
 
 pub const NEURAL: LearnerKind = LearnerKind {
     name: "neural",
@@ -42,9 +36,12 @@ pub const NEURAL: LearnerKind = LearnerKind {
     is_single: false,
     steps: |config| config.neural.steps,
     episode_steps: |config| Some(config.neural.episode_steps),
-    done: |contents| Ok(contents.state::<SavedNeural<'_>>()?.world_steps),
+    done: |contents| Ok(contents.state::<SavedNeural>()?.world_steps),
     adopt: |_, _| {},
-    read: |contents, device, learned| Ok(learned.put(saved::read(contents, device)?)),
+    read: |contents, device, learned| {
+        let model = contents.state::<SavedNeural>()?.model;
+        Ok(learned.put(model.read(&contents.part(""), device)?))
+    },
     begin,
 };
 
@@ -63,8 +60,6 @@ pub struct NeuralLearner {
     reward: RewardEstimate,
     replay: LessonReplay,
     runs: Vec<Run>,
-    /// The saved run of each robot, kept until the learner is attached to its robots.
-    saved_runs: BTreeMap<u32, SavedRun>,
     world_steps: u64,
     /// Number of updates that are due but not made yet.
     earned: f64,
@@ -93,7 +88,6 @@ impl NeuralLearner {
             reward: RewardEstimate::new(n_observations),
             replay: LessonReplay::new(config.neural.replay_frames),
             runs: Vec::new(),
-            saved_runs: BTreeMap::new(),
             world_steps: 0,
             earned: 0.0,
             worlds,
@@ -129,21 +123,6 @@ impl NeuralLearner {
         ))
     }
 
-    /// Begins a robot's track and its run with the first observation of an episode.
-    fn begun(&mut self, robot: u32, observation: Observation) -> Result<Run> {
-        let mut rollout = self.rollout_at(observation)?;
-        self.replay.begin(robot, self.worlds.shape());
-        let base = rollout.agent.estimator().base();
-        self.replay.push(robot, &rollout.observation().frame, base);
-        rollout.correct()?;
-        rollout.agent.predict();
-        Ok(Run {
-            rollout,
-            behaviour: None,
-            path: Vec::new(),
-        })
-    }
-
     /// Returns the completed fraction of the training steps.
     fn progress(&self) -> f64 {
         self.world_steps as f64 / self.config.neural.steps.max(1) as f64
@@ -157,30 +136,19 @@ impl NeuralLearner {
 
     fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedNeural = contents.state()?;
-        let (expected, got) = (self.worlds.n_observations, saved.n_observations);
+        let (expected, got) = (self.worlds.n_observations, saved.model.n_observations());
         check(got == expected, "n_observations", expected, got)?;
-        saved.load_into(&mut self.network, contents)?;
-        self.filter = saved.filter(contents)?;
-        let shape = self.worlds.shape();
-        if saved.shape == shape {
-            saved.check_worlds()?;
-            self.replay.resume(saved.replay.into_owned());
-            (self.saved_runs, self.earned) = (saved.worlds, saved.earned);
-        }
-        (self.reward, self.world_steps) = (saved.reward.into_owned(), saved.world_steps);
+        check_counts(&[
+            ("n_updates", saved.n_updates),
+            ("world_steps", saved.world_steps),
+        ])?;
+        contents.check_squares()?;
+        saved.reward.check(expected)?;
+        self.filter = saved.model.read_filter(&contents.part(""))?;
+        let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
+        self.network.load(find, saved.n_updates)?;
+        (self.reward, self.world_steps) = (saved.reward, saved.world_steps);
         Ok(())
-    }
-}
-
-impl Run {
-    /// Restores a run from a checkpoint. The belief of `rollout` must not have been corrected yet.
-    fn restore(saved: SavedRun, mut rollout: Rollout) -> Result<Self> {
-        saved.resume_point.restore(&mut rollout.agent)?;
-        Ok(Self {
-            rollout,
-            behaviour: saved.behaviour,
-            path: Vec::new(),
-        })
     }
 }
 
@@ -239,10 +207,20 @@ impl Actor for NeuralLearner {
     }
 }
 
-impl Learning for NeuralLearner {
+impl Learner for NeuralLearner {
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let run = self.begun(robot, observation)?;
-        self.runs[(robot - self.worlds.numbers.start) as usize] = run;
+        let mut rollout = self.rollout_at(observation)?;
+        self.replay.begin(robot, self.worlds.shape());
+        let base = rollout.agent.estimator().base();
+        self.replay.push(robot, &rollout.observation().frame, base);
+        rollout.correct()?;
+        rollout.agent.predict();
+        let run = Run {
+            rollout,
+            behaviour: None,
+            path: Vec::new(),
+        };
+        replace(&mut self.runs, &self.worlds, robot, run);
         Ok(())
     }
 
@@ -290,52 +268,18 @@ impl Learning for NeuralLearner {
         }
         "the frames show no cell".into()
     }
-}
-
-impl Saving for NeuralLearner {
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let mut saved_runs = std::mem::take(&mut self.saved_runs);
-        let robots = self.worlds.numbers.clone().zip(&observations);
-        saved_runs.retain(|robot, saved| {
-            let mut robots = robots.clone();
-            robots.any(|(other, observation)| {
-                other == *robot && saved.resume_point.is_of(observation)
-            })
-        });
-        if saved_runs.is_empty() {
-            // The saved frames come from other worlds, which may have another model.
-            self.replay.forget();
-            self.earned = 0.0;
-        }
-        self.replay.end_others(&self.worlds.numbers);
-        let n_resumed = saved_runs.len();
-        for (robot, observation) in self.worlds.numbers.clone().zip(observations) {
-            let run = match saved_runs.remove(&robot) {
-                Some(saved) => Run::restore(saved, self.rollout_at(observation)?)?,
-                None => self.begun(robot, observation)?,
-            };
-            self.runs.push(run);
-        }
-        Ok(n_resumed)
-    }
 
     fn contents(&self) -> Result<Contents> {
-        let runs = self.runs.iter();
-        let runs = runs.map(|run| SavedRun {
-            resume_point: ResumePoint::of(&run.rollout),
-            behaviour: run.behaviour,
-        });
-        let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(runs).collect();
+        let model = NeuralModel {
+            network: self.network.clone(),
+            filter: self.filter.clone(),
+            target: self.paying(),
+        };
         let state = SavedNeural {
-            shape: self.worlds.shape(),
-            n_observations: self.worlds.n_observations,
+            model: SavedNeuralModel::of(&model),
+            reward: self.reward.clone(),
             n_updates: self.n_updates(),
             world_steps: self.world_steps,
-            earned: self.earned,
-            filter: self.filter.as_deref().map(SavedModel::of),
-            reward: Cow::Borrowed(&self.reward),
-            replay: Cow::Borrowed(&self.replay),
-            worlds,
         };
         let filter = self.filter.iter().flat_map(|it| corrected_tensors(it));
         let tensors = self.network.named_tensors()?.into_iter().chain(filter);

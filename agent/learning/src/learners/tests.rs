@@ -9,9 +9,9 @@ use crate::learned::Learned;
 use crate::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use crate::learners::filter::FilterLearner;
 use crate::learners::filter::fit::FilterFit;
-use crate::learners::network::{NetworkLearner, Progress, SavedNetwork};
+use crate::learners::network::{NetworkLearner, Progress};
 use crate::learners::neural::NeuralLearner;
-use crate::learners::{Learner, Learning, ModelUpdate, Saving, Worlds};
+use crate::learners::{Learner, ModelUpdate, Worlds};
 use crate::rollout::Seen;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
@@ -20,7 +20,7 @@ use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Airspace, Frame, Model, Shape};
-use emberwatch_network::{Device, DqnSettings, NeuralBelief, Transition};
+use emberwatch_network::{Device, Dqn, DqnSettings, NeuralBelief, Transition};
 
 pub(crate) fn worlds() -> Worlds {
     Worlds {
@@ -77,7 +77,7 @@ fn fly(learner: &mut impl Learner, step: u64) -> Belief {
 }
 
 fn check_basis(mut learner: impl Learner, basis: BasisKind) {
-    learner.attach(vec![observation(0)]).expect("possible");
+    learner.begin(0, observation(0)).expect("possible");
     let estimate = fly(&mut learner, 1);
     let agent = &learner.rollout(0).agent;
     let is_basis = [&estimate, agent.belief()].map(|belief| belief == agent.basis_belief());
@@ -94,9 +94,9 @@ fn check_basis(mut learner: impl Learner, basis: BasisKind) {
 fn learners_plan_on_the_configured_belief() {
     for basis in [BasisKind::Predictor, BasisKind::Estimate] {
         let config = &config(basis);
-        let learner = FilterLearner::new(dimensions(), worlds(), config);
-        check_basis(learner, basis);
-        let progress = Progress::first(&worlds(), config, &Device::Cpu);
+        let learner = FilterLearner::new(None, dimensions(), worlds(), config);
+        check_basis(learner.expect("new"), basis);
+        let progress = Progress::first(&worlds().form(), config, &Device::Cpu);
         let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
         check_basis(learner, basis);
         let learner = NeuralLearner::new(None, None, worlds(), config, &Device::Cpu);
@@ -129,7 +129,7 @@ pub(crate) fn learned_filter() -> LearnedModel {
 }
 
 #[test]
-fn decisions_resume_bit_for_bit() {
+fn decisions_continue_from_what_was_learned() {
     let mut config = config(BasisKind::Estimate);
     let decisions = &mut config.decisions;
     (decisions.learning.batch, decisions.updates_per_step) = (4, 1.0);
@@ -155,7 +155,7 @@ fn decisions_resume_bit_for_bit() {
     ] {
         let base = Base::new(kind, None, learned, worlds().shape()).expect("learned");
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
-        learner.attach(vec![observation(0)]).expect("possible");
+        learner.begin(0, observation(0)).expect("possible");
         let first = learner.contents().expect("whole");
         let left = learn(&mut learner, 1..12);
         assert!(left.tensors != first.tensors, "something was learned");
@@ -164,17 +164,16 @@ fn decisions_resume_bit_for_bit() {
         let base = base.expect("whole").expect("a belief");
         let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);
         let mut resumed = resumed.expect("its own");
-        let n_resumed = resumed.attach(vec![observation(11)]).expect("possible");
-        assert_eq!(n_resumed, 1);
-        let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 12..18));
-        assert!(contents[0] == contents[1], "{kind:?}");
-        assert!(learner.n_updates() > 8, "{kind:?}");
+        assert!(resumed.contents().expect("whole") == left, "{kind:?}");
+        resumed.begin(0, observation(12)).expect("possible");
+        learn(&mut resumed, 13..24);
+        assert!(resumed.n_updates() > learner.n_updates(), "{kind:?}");
     }
 }
 
 /// Flies an episode in which the reward of a step is its number, and begins the next one.
-fn fly_episode(mut learner: impl Learner, (n_steps, is_terminated): (u64, bool)) -> Contents {
-    learner.attach(vec![observation(0)]).expect("possible");
+fn fly_episode(learner: &mut impl Learner, (n_steps, is_terminated): (u64, bool)) {
+    learner.begin(0, observation(0)).expect("possible");
     for step in 1..=n_steps {
         learner.plan();
         let mut seen = observation(step);
@@ -185,7 +184,6 @@ fn fly_episode(mut learner: impl Learner, (n_steps, is_terminated): (u64, bool))
         learner.predict();
     }
     learner.begin(0, observation(0)).expect("possible");
-    learner.contents().expect("whole")
 }
 
 /// Lengths of episodes, and whether they are terminated. Others are truncated.
@@ -193,14 +191,15 @@ const EPISODES: [(u64, bool); 5] = [(1, true), (3, false), (4, true), (6, false)
 
 /// Checks the transitions of `fly_episode`, which sum up the rewards of `n_step` steps.
 fn check_transitions(
-    got: &[Transition],
+    dqn: &Dqn,
     (n_steps, is_terminated): (u64, bool),
     learning: &DqnSettings,
     scale: f32,
 ) {
     let (gamma, n) = (learning.gamma, learning.n_step as u64);
+    let got: Vec<&Transition> = dqn.remembered().iter().collect();
     assert_eq!(got.len() as u64, n_steps);
-    for (first, got) in (1..).zip(got) {
+    for (first, got) in (1..).zip(&got) {
         let last = n_steps.min(first + n - 1);
         let rewards = (first..=last).rev().map(|step| step as f32 * scale);
         let reward = rewards.fold(0.0, |sum, reward| reward + gamma * sum);
@@ -222,14 +221,9 @@ fn decisions_learn_from_every_step_of_an_episode() {
     let scale = config.decisions.reward_scale / worlds().n_moves as f32;
     for episode in EPISODES {
         let learner = DecisionsLearner::new(known_base(), None, worlds(), &config);
-        let left = fly_episode(learner.expect("new"), episode);
-        let saved: SavedDecisions = left.state().expect("its state");
-        check_transitions(
-            &saved.dqn.transitions,
-            episode,
-            &config.decisions.learning,
-            scale,
-        );
+        let mut learner = learner.expect("new");
+        fly_episode(&mut learner, episode);
+        check_transitions(&learner.dqn, episode, &config.decisions.learning, scale);
     }
 }
 
@@ -238,18 +232,17 @@ fn the_network_learns_from_every_step_of_an_episode() {
     let mut config = config(BasisKind::Estimate);
     config.dqn.learning.n_step = 4;
     for episode in EPISODES {
-        let progress = Progress::first(&worlds(), &config, &Device::Cpu);
-        let learner = NetworkLearner::new(progress.expect("a network"), worlds(), &config);
-        let left = fly_episode(learner, episode);
-        let saved: SavedNetwork = left.state().expect("its state");
-        check_transitions(&saved.dqn.transitions, episode, &config.dqn.learning, 1.0);
+        let progress = Progress::first(&worlds().form(), &config, &Device::Cpu);
+        let mut learner = NetworkLearner::new(progress.expect("a network"), worlds(), &config);
+        fly_episode(&mut learner, episode);
+        check_transitions(&learner.progress.dqn, episode, &config.dqn.learning, 1.0);
     }
 }
 
 /// Checks that the step size falls linearly over 10 steps, to a fifth of `rate`. `rate_of` returns an update's step
 /// size.
 fn check_rates(mut learner: impl Learner, rate: f64, rate_of: fn(&ModelUpdate) -> Option<f64>) {
-    learner.attach(vec![observation(0)]).expect("possible");
+    learner.begin(0, observation(0)).expect("possible");
     let mut rates = Vec::new();
     for step in 1..14 {
         fly(&mut learner, step);
@@ -295,31 +288,27 @@ fn neural(
 }
 
 #[test]
-fn a_neural_belief_resumes_bit_for_bit() {
+fn a_neural_belief_continues_from_what_was_learned() {
     let filter = learned_filter();
     for filter in [None, Some(&filter)] {
         let mut learner = neural(None, filter, worlds()).expect("new");
-        learner.attach(vec![observation(0)]).expect("possible");
+        learner.begin(0, observation(0)).expect("possible");
         let bias = |contents: &Contents| contents.tensors["head.bias"].clone();
         let before = bias(&learner.contents().expect("whole"));
         let left = learn(&mut learner, 1..12);
         assert!(bias(&left) != before, "something was learned");
-        let resumed = || neural(Some(&left), None, worlds()).expect("its own");
-        let mut continued = resumed();
-        let n_resumed = continued.attach(vec![observation(11)]).expect("possible");
-        assert_eq!(n_resumed, 1);
-        let contents = [&mut learner, &mut continued].map(|learner| learn(learner, 12..16));
-        assert!(contents[0] == contents[1] && learner.n_updates() > 11);
-        let mut elsewhere = resumed();
-        let n_resumed = elsewhere.attach(vec![observation(7)]).expect("possible");
-        assert_eq!((n_resumed, elsewhere.n_updates()), (0, 11));
+        let mut resumed = neural(Some(&left), None, worlds()).expect("its own");
+        assert!(resumed.contents().expect("whole") == left);
+        resumed.begin(0, observation(12)).expect("possible");
+        learn(&mut resumed, 13..16);
+        assert_eq!((learner.n_updates(), resumed.n_updates()), (11, 14));
     }
 }
 
 #[test]
 fn errors_name_what_does_not_fit_a_neural_belief() {
     let mut learner = neural(None, None, worlds()).expect("new");
-    learner.attach(vec![observation(0)]).expect("possible");
+    learner.begin(0, observation(0)).expect("possible");
     let left = learn(&mut learner, 1..5);
     let refused = |contents: &Contents, worlds: Worlds, words: &str| {
         let learner = neural(Some(contents), None, worlds).map(drop);

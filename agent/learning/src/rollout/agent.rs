@@ -276,13 +276,6 @@ impl Agent {
         }
     }
 
-    /// Restores an estimate p_k, if paths are planned on it.
-    pub fn remember_estimate(&mut self, estimate: Option<&Belief>) {
-        if self.basis == BasisKind::Estimate {
-            self.estimate = estimate.cloned();
-        }
-    }
-
     /// Returns the belief, which is about X_k after `correct` and about X_{k+1} after `predict`.
     pub fn belief(&self) -> &Belief {
         self.estimator.belief()
@@ -290,10 +283,6 @@ impl Agent {
 
     pub fn estimator(&self) -> &dyn Estimator {
         &*self.estimator
-    }
-
-    pub fn estimator_mut(&mut self) -> &mut dyn Estimator {
-        &mut *self.estimator
     }
 
     /// Returns the name of the format of [`Self::handover`]. `None` if no other agent can resume from this agent.
@@ -331,11 +320,6 @@ impl Agent {
     /// Replaces the estimator, for example with one that has newer parameters.
     pub fn set_estimator(&mut self, estimator: Box<dyn Estimator>) {
         self.estimator = estimator;
-    }
-
-    /// Returns the estimate p_k, if paths are planned on it.
-    pub fn estimate(&self) -> Option<&Belief> {
-        self.estimate.as_ref()
     }
 
     /// Returns the message for observers. `planning` is the time that the last planning took.

@@ -206,9 +206,9 @@ impl Dqn {
         self.adam.steps()
     }
 
-    /// Returns the number of transitions in the replay buffer.
-    pub fn n_remembered(&self) -> usize {
-        self.memory.len()
+    /// Returns the replay buffer, the oldest transition first.
+    pub fn remembered(&self) -> &VecDeque<Transition> {
+        &self.memory
     }
 
     /// Sets the learning rate.
@@ -353,7 +353,7 @@ impl Dqn {
 
     /// Returns whether a transition fits the DQN. The input must contain the features of one candidate, and the next
     /// input the features of all candidates.
-    pub(super) fn fits(&self, transition: &Transition) -> bool {
+    fn fits(&self, transition: &Transition) -> bool {
         transition.input.len() == self.shape.n_inputs
             && transition.next.len() == self.shape.n_numbers()
             && transition.action < self.shape.n_outputs

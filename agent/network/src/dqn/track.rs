@@ -1,10 +1,9 @@
 //! Transitions, and n-step returns.
 
-use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
 /// A transition `(h, a, r, h')` of the replay buffer, with the discount of the value of `h'`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Transition {
     /// The input before the action. With several candidates, the features of the chosen candidate.
     pub input: Vec<f32>,
@@ -19,11 +18,11 @@ pub struct Transition {
 }
 
 /// The latest steps of one episode, whose n-step returns are still incomplete (Sutton and Barto, section 7.1).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Track {
-    pub(super) n_step: usize,
+    n_step: usize,
     /// Steps with incomplete transitions, the oldest first.
-    pub(super) open: VecDeque<Transition>,
+    open: VecDeque<Transition>,
 }
 
 impl Track {

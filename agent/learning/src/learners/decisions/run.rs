@@ -1,12 +1,16 @@
 //! A robot that flies options: its agent, and its unfinished transitions.
 
-use super::saved::{Held, SavedRun};
-use crate::learners::resume_point::ResumePoint;
 use crate::rollout::Rollout;
-use anyhow::Result;
 use emberwatch_belief::planning::Proposal;
 use emberwatch_model::Move;
 use emberwatch_network::{Dqn, Track, Transition};
+
+/// A random option that is flown for several steps in a row, and the remaining steps.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Held {
+    pub(super) option: usize,
+    pub(super) n_steps: u64,
+}
 
 pub(super) struct Run {
     pub(super) rollout: Rollout,
@@ -63,29 +67,6 @@ impl Run {
         let features = features(&self.propose());
         let full = self.led_to(&features, dqn);
         full.into_iter().chain(self.track.end()).collect()
-    }
-
-    pub(super) fn saved(&self) -> SavedRun {
-        SavedRun {
-            resume_point: ResumePoint::of(&self.rollout),
-            memory: self.rollout.agent.memory.clone(),
-            last: self.last.clone(),
-            track: self.track.clone(),
-            held: self.held,
-        }
-    }
-
-    /// Restores a run from a checkpoint. The belief of `rollout` must not have been corrected yet.
-    pub(super) fn restore(saved: SavedRun, mut rollout: Rollout, dqn: &Dqn) -> Result<Self> {
-        saved.resume_point.restore(&mut rollout.agent)?;
-        rollout.agent.memory = saved.memory;
-        Ok(Self {
-            rollout,
-            last: saved.last,
-            track: dqn.resume_track(saved.track)?,
-            held: saved.held,
-            next: None,
-        })
     }
 }
 

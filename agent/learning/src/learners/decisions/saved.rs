@@ -1,39 +1,27 @@
-//! Checkpoints of decisions: the DQN, the belief that it was trained on, and the state of the robots.
+//! Checkpoints of decisions: the DQN, and the belief that it was trained on.
 
 use super::base::{Base, belief_of};
 use crate::beliefs::learned::{LearnedModel, SavedModel};
 use crate::beliefs::neural::{NeuralModel, SavedNeuralModel};
 use crate::beliefs::{BeliefKind, NEURAL};
-use crate::checkpoint::{Contents, check, check_counts, check_earned, check_numbers};
+use crate::checkpoint::{Contents, check, check_counts};
 use crate::learned::Learned;
-use crate::learners::resume_point::ResumePoint;
 use crate::policy::LearnedDecisions;
 use anyhow::{Context, Result, ensure};
+use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
-use emberwatch_belief::planning::{Memory, OPTIONS};
 use emberwatch_model::Shape;
-use emberwatch_network::{Device, Dqn, DqnShape, NamedTensor, SavedDqn, Track};
+use emberwatch_network::{Device, Dqn, DqnShape, NamedTensor};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// The shape of the DQN: features per option, and number of options.
 pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
 
-/// Maximum number of steps for which an option is held.
-const LONGEST_HOLD: u64 = 1000;
-
 const NOTHING: &str = "decisions: expected a checkpoint of a learned belief, got none";
 
 /// Prefix of the names of the belief's tensors.
 pub(super) const BELIEF: &str = "belief.";
-
-/// A random option that is flown for several steps in a row, and the remaining steps.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Held {
-    pub(super) option: usize,
-    pub(super) n_steps: u64,
-}
 
 /// A checkpoint of decisions, without its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -42,20 +30,8 @@ pub struct SavedDecisions {
     /// The name of the belief that the decisions are based on.
     pub estimator: String,
     pub(super) belief: Option<SavedBelief>,
+    pub n_updates: u64,
     pub world_steps: u64,
-    pub(super) earned: f64,
-    pub dqn: SavedDqn,
-    pub(super) worlds: BTreeMap<u32, SavedRun>,
-}
-
-/// The saved state of a run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct SavedRun {
-    pub(super) resume_point: ResumePoint,
-    pub(super) memory: Memory,
-    pub(super) last: Option<(Vec<f32>, f32)>,
-    pub(super) track: Track,
-    pub(super) held: Held,
 }
 
 /// A learned belief, without its tensors.
@@ -156,41 +132,11 @@ impl SavedDecisions {
         let got = self.options.join(" ");
         check(got == expected, "options", &expected, &got)?;
         check_counts(&[
-            ("dqn.n_updates", self.dqn.n_updates),
+            ("n_updates", self.n_updates),
             ("world_steps", self.world_steps),
         ])?;
-        check_earned(self.earned)?;
         contents.check_squares()?;
-        dqn.load(|name, shape| contents.tensor(name, shape), &self.dqn)
-    }
-}
-
-impl SavedRun {
-    pub(super) fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
-        self.resume_point.check(n_states, shape)?;
-        let expected = format!("a memory of a {shape} grid");
-        check(
-            self.memory.is_of(shape),
-            "worlds.memory",
-            expected,
-            "another",
-        )?;
-        if let Some((features, reward)) = &self.last {
-            check_numbers("worlds.last", features, N_FEATURES)?;
-            check_numbers("worlds.last", &[*reward], 1)?;
-        }
-        let Held { option, n_steps } = self.held;
-        let expected = format!(
-            "an option below {}, for at most {LONGEST_HOLD} steps",
-            OPTIONS.len()
-        );
-        let fits = option < OPTIONS.len() && n_steps <= LONGEST_HOLD;
-        check(
-            fits,
-            "worlds.held",
-            expected,
-            format!("{option} for {n_steps}"),
-        )
+        dqn.load(|name, shape| contents.tensor(name, shape), self.n_updates)
     }
 }
 
@@ -199,10 +145,6 @@ mod tests {
     use super::*;
     use crate::beliefs::KNOWN;
     use crate::config::AgentConfig;
-    use emberwatch_belief::Belief;
-    use emberwatch_messages::message::{RobotResult, WorldResult};
-    use emberwatch_messages::observation::Observation;
-    use emberwatch_model::Frame;
 
     #[test]
     fn errors_name_what_is_wrong_with_a_checkpoint() {
@@ -212,10 +154,8 @@ mod tests {
             options: OPTIONS.map(|option| option.name.into()).into(),
             estimator: KNOWN.name.into(),
             belief: None,
+            n_updates: 3,
             world_steps: 7,
-            earned: 0.5,
-            dqn: dqn.saved(),
-            worlds: BTreeMap::new(),
         };
         let mut contents = Contents::new(dqn.named_tensors(), &state);
         let read = |contents: &Contents| read(contents, &Device::Cpu, &mut Learned::default());
@@ -232,40 +172,7 @@ mod tests {
         };
         let words = "options: expected exploit exploit_entropy";
         refused(|saved| saved.options.truncate(1), words);
-        let words = "dqn.n_updates: expected at most";
-        refused(|saved| saved.dqn.n_updates = u64::MAX, words);
-        refused(|saved| saved.earned = f64::NAN, "earned: expected 0 to");
-    }
-
-    #[test]
-    fn errors_name_what_does_not_fit_a_robot() {
-        let shape = |width| Shape::new(2, width).expect("test shape");
-        let observation = Observation {
-            world: WorldResult::default(),
-            robot: RobotResult::default(),
-            frame: Frame::empty(shape(3)),
-        };
-        let dqn = Dqn::new(AgentConfig::default().decisions.settings(), SHAPE, 3);
-        let n = OPTIONS.len();
-        for (n_states, width, option, n_steps, words) in [
-            (3, 3, n - 1, 1000, ""),
-            (3, 3, n, 1, "worlds.held: expected an option below"),
-            (3, 3, 0, 1001, "worlds.held: expected an option below"),
-            (3, 4, 0, 1, "worlds.memory: expected a memory of a 2 x 3"),
-            (2, 3, 0, 1, "worlds.estimate: expected 3 states on 2 x 3"),
-        ] {
-            let estimate = Belief::uniform(n_states, shape(3));
-            let run = SavedRun {
-                resume_point: ResumePoint::with_estimate(&observation, estimate),
-                memory: Memory::new(shape(width)),
-                last: None,
-                track: dqn.track(),
-                held: Held { option, n_steps },
-            };
-            let checked = run.check(3, shape(3));
-            let error = checked.map_or_else(|error| error.to_string(), |()| String::new());
-            assert!(error.starts_with(words), "{error}");
-            assert_eq!(error.is_empty(), words.is_empty(), "{error}");
-        }
+        let words = "n_updates: expected at most";
+        refused(|saved| saved.n_updates = u64::MAX, words);
     }
 }

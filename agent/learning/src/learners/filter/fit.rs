@@ -4,9 +4,11 @@ mod neighbours;
 
 pub use self::neighbours::Neighbours;
 
-use crate::beliefs::learned::{LearnedModel, named_tensors, read_parameters};
-use crate::checkpoint::{Contents, check, check_counts, check_earned};
-use crate::config::{AgentConfig, LearningConfig};
+use super::saved::SavedFilter;
+use crate::beliefs::learned::{LearnedModel, SavedModel, named_tensors, read_parameters};
+use crate::checkpoint::{Contents, check_counts};
+use crate::config::AgentConfig;
+use crate::gradient::Adam;
 use crate::gradient::{Optimiser, Update};
 use crate::learners::base::lacks_steps;
 use crate::replay::BlockReplay;
@@ -15,14 +17,12 @@ use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_model::{Frame, Shape};
-use emberwatch_network::NamedTensor;
-use serde::{Deserialize, Serialize};
 
 /// Suffixes of tensor names: parameters, mean gradients and mean squared gradients.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
-/// A filter that is fitted to frames as they arrive. A checkpoint stores this struct, and its tensors separately.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+/// A filter that is fitted to frames as they arrive.
+#[derive(Debug, Clone)]
 pub struct FilterFit {
     pub optimiser: Optimiser,
     pub reward: RewardEstimate,
@@ -43,7 +43,10 @@ impl FilterFit {
             reward: RewardEstimate::new(dimensions.n_states),
             world_steps: 0,
             earned: 0.0,
-            replay: replay(&config.learning),
+            replay: BlockReplay::new(
+                config.learning.window * config.learning.block_windows,
+                config.learning.replay_frames,
+            ),
             neighbours: Neighbours::default(),
         }
     }
@@ -51,12 +54,7 @@ impl FilterFit {
     /// Begins a new track for a robot.
     pub fn begin(&mut self, robot: u32) {
         self.replay.begin(robot);
-        self.neighbours
-            .begin(robot, self.optimiser.cut().0.n_cells());
-    }
-
-    pub fn has_track(&self, robot: u32) -> bool {
-        self.replay.has_track(robot)
+        self.neighbours.begin(robot, self.optimiser.shape.n_cells());
     }
 
     /// Adds a robot's next frame. `predictor` is the belief before the frame (`None` for the track's first frame), and
@@ -96,14 +94,6 @@ impl FilterFit {
         Ok(updates)
     }
 
-    /// Drops all frames and tracks. The learned parameters remain.
-    pub fn forget(&mut self) {
-        self.replay = replay(self.optimiser.config());
-        self.optimiser.leave_replay();
-        self.earned = 0.0;
-        self.neighbours.forget_robots();
-    }
-
     pub fn learned(&self) -> LearnedModel {
         let parameters = self.optimiser.parameters();
         let last = parameters.dimensions.n_states - 1;
@@ -133,71 +123,48 @@ impl FilterFit {
         self.optimiser.adam.n_steps
     }
 
-    /// Returns the parameters and moments as named tensors.
-    pub fn named_tensors(&self) -> Vec<NamedTensor> {
+    /// Returns the contents of a checkpoint.
+    pub fn contents(&self) -> Contents {
         let adam = &self.optimiser.adam;
         let parts = [self.optimiser.parameters(), &adam.first, &adam.second];
         let parts = SUFFIXES.into_iter().zip(parts);
-        parts
-            .flat_map(|(suffix, part)| named_tensors(part, suffix))
-            .collect()
+        let tensors = parts.flat_map(|(suffix, part)| named_tensors(part, suffix));
+        let state = SavedFilter {
+            model: SavedModel::of(&self.learned()),
+            reward: self.reward.clone(),
+            n_updates: self.n_updates(),
+            world_steps: self.world_steps,
+        };
+        Contents::new(tensors, &state)
     }
 
-    /// Loads the tensors from a checkpoint with the given dimensions.
-    ///
-    /// # Errors
-    /// If a tensor is missing or has another form. The error names it.
-    pub fn load(&mut self, contents: &Contents, dimensions: Dimensions) -> Result<()> {
-        let counts = [
-            ("n_updates", self.n_updates()),
-            ("world_steps", self.world_steps),
-        ];
-        check_counts(&counts)?;
-        let part = contents.part("");
-        let [parameters, first, second] =
-            SUFFIXES.map(|suffix| read_parameters(dimensions, &part, suffix));
-        self.optimiser.set_parameters(parameters?);
-        (self.optimiser.adam.first, self.optimiser.adam.second) = (first?, second?);
-        contents.check_squares()?;
-        self.reward.check(dimensions.n_states)
-    }
-
-    /// Resumes from a checkpoint. The replay buffer starts empty if the checkpoint's grid, windows or streams differ
-    /// from the settings.
+    /// Loads a checkpoint of a filter with the same dimensions.
     ///
     /// # Errors
     /// If a value is missing or does not fit. The error names it.
-    pub fn resume(
-        mut saved: Self,
-        contents: &Contents,
-        dimensions: Dimensions,
-        shape: Shape,
-        config: &AgentConfig,
-    ) -> Result<Self> {
-        saved.load(contents, dimensions)?;
-        let mut fit = Self::new(dimensions, shape, config);
-        if saved.optimiser.cut() == fit.optimiser.cut() {
-            check_earned(saved.earned)?;
-            fit.earned = saved.earned;
-            let (n_states, n_observations) = (dimensions.n_states, dimensions.n_observations);
-            let replay = &mut fit.replay;
-            replay.resume(saved.replay, shape, n_states, n_observations)?;
-            let n_cells = shape.n_cells();
-            let (name, expected) = ("neighbours.ages", format!("ages of {n_cells} cells"));
-            check(saved.neighbours.are_of(n_cells), name, expected, "others")?;
-        } else {
-            saved.neighbours.forget_robots();
-        }
-        fit.optimiser.resume(saved.optimiser)?;
-        fit.reward = saved.reward;
-        fit.neighbours = saved.neighbours;
-        fit.world_steps = saved.world_steps;
-        Ok(fit)
+    pub fn load(&mut self, contents: &Contents) -> Result<()> {
+        let saved: SavedFilter = contents.state()?;
+        check_counts(&[
+            ("n_updates", saved.n_updates),
+            ("world_steps", saved.world_steps),
+        ])?;
+        let (dimensions, part) = (self.optimiser.dimensions(), contents.part(""));
+        let [parameters, first, second] =
+            SUFFIXES.map(|suffix| read_parameters(dimensions, &part, suffix));
+        let (parameters, first, second) = (parameters?, first?, second?);
+        contents.check_squares()?;
+        saved.reward.check(dimensions.n_states)?;
+        let model = saved.model.read(&part)?;
+        let adam = Adam {
+            first,
+            second,
+            n_steps: saved.n_updates,
+        };
+        self.optimiser.resume(parameters, adam);
+        self.neighbours = Neighbours::of(model.correlations, model.target);
+        (self.reward, self.world_steps) = (saved.reward, saved.world_steps);
+        Ok(())
     }
-}
-
-fn replay(config: &LearningConfig) -> BlockReplay {
-    BlockReplay::new(config.window * config.block_windows, config.replay_frames)
 }
 
 #[cfg(test)]
@@ -245,38 +212,25 @@ mod tests {
         fit
     }
 
-    fn contents(fit: &FilterFit) -> Contents {
-        Contents::new(fit.named_tensors(), fit)
-    }
-
-    fn resume(
-        contents: &Contents,
-        dimensions: Dimensions,
-        config: &AgentConfig,
-    ) -> Result<FilterFit, String> {
-        let fit = contents
-            .state()
-            .and_then(|saved| FilterFit::resume(saved, contents, dimensions, shape(), config));
-        fit.map_err(|error| error.to_string())
+    fn resume(contents: &Contents, dimensions: Dimensions) -> Result<FilterFit, String> {
+        let mut fit = FilterFit::new(dimensions, shape(), &config());
+        let loaded = fit.load(contents);
+        loaded.map_err(|error| error.to_string()).map(|()| fit)
     }
 
     #[test]
-    fn a_fit_resumes_exactly_unless_its_streams_differ() {
-        let mut fit = fit();
+    fn a_fit_continues_from_what_was_learned() {
+        let fit = fit();
         assert!(fit.n_updates() > 0);
         assert_eq!(fit.world_steps, 7);
-        let stored = contents(&fit);
-        let mut same = resume(&stored, DIMENSIONS, &config()).expect("whole");
-        assert!(same.has_track(4) && contents(&same) == stored);
-        let later = |fit: &mut FilterFit| see(fit, &[1, 0, 0, 1, 1]);
-        later(&mut fit);
-        later(&mut same);
-        assert!(contents(&same) == contents(&fit) && contents(&same) != stored);
-        let mut config = config();
-        config.learning.streams = 3;
-        let other = resume(&stored, DIMENSIONS, &config).expect("whole");
-        assert!(!other.has_track(4), "an empty replay");
-        assert_eq!(contents(&other).tensors, stored.tensors);
+        let stored = fit.contents();
+        let mut same = resume(&stored, DIMENSIONS).expect("whole");
+        assert_eq!(same.contents(), stored);
+        assert_eq!(same.learned(), fit.learned());
+        assert_eq!(same.replay.n_blocks(), 0);
+        same.begin(4);
+        see(&mut same, &[1, 0, 0, 1, 1]);
+        assert!(same.n_updates() > fit.n_updates());
     }
 
     #[test]
@@ -293,27 +247,21 @@ mod tests {
         let other = |change: fn(&mut Dimensions), words: &str| {
             let mut dimensions = DIMENSIONS;
             change(&mut dimensions);
-            let error = resume(&contents(&fit()), dimensions, &config()).expect_err(words);
+            let error = resume(&fit().contents(), dimensions).expect_err(words);
             assert_eq!(error, words);
         };
         let words = "kernel: expected shape [3, 3, 3, 3], got [3, 3, 1, 3]";
         other(|dimensions| dimensions.kernel = (3, 3), words);
         let words = "likelihood: expected shape [3, 4], got [3, 2]";
         other(|dimensions| dimensions.n_observations = 4, words);
-        let forged = |change: fn(&mut Contents, &mut FilterFit), words: &str| {
-            let (mut contents, mut saved) = (contents(&fit()), fit());
+        let forged = |change: fn(&mut Contents, &mut SavedFilter), words: &str| {
+            let mut contents = fit().contents();
+            let mut saved = contents.state().expect("its state");
             change(&mut contents, &mut saved);
             contents.set_state(&saved);
-            let error = resume(&contents, DIMENSIONS, &config()).expect_err(words);
+            let error = resume(&contents, DIMENSIONS).expect_err(words);
             assert!(error.starts_with(words), "{error}");
         };
-        forged(
-            |contents, _| {
-                let kernel = contents.tensors.get_mut("kernel");
-                kernel.expect("a tensor").shape.insert(0, 3);
-            },
-            "kernel: expected one kernel for all cells, got kernels by own state or zone: train the filter again",
-        );
         forged(
             |contents, _| drop(contents.tensors.remove("initial.first_moment")),
             "initial.first_moment: expected a tensor of shape [3], got none",
@@ -325,13 +273,9 @@ mod tests {
             },
             "kernel.second_moment: expected no negative numbers, got -0.5",
         );
-        let words = "earned: expected 0 to 2000000, got 1";
-        forged(|_, saved| saved.earned = 1e300, words);
         let words = "reward.rewards: expected 3 finite numbers, got NaN";
         forged(|_, saved| saved.reward.rewards[1] = f64::NAN, words);
         let words = "n_updates: expected at most";
-        forged(|_, saved| saved.optimiser.adam.n_steps = u64::MAX, words);
-        let words = "streams: expected 2, got 0";
-        forged(|_, saved| saved.optimiser.streams.clear(), words);
+        forged(|_, saved| saved.n_updates = u64::MAX, words);
     }
 }

@@ -6,7 +6,6 @@ use emberwatch_model::{Airspace, Grid, Shape};
 use emberwatch_network::Sightings;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
-use serde::{Deserialize, Serialize};
 
 /// Average number of steps between changes of behaviour.
 const STEPS: u64 = 20;
@@ -16,13 +15,13 @@ const STEPS: u64 = 20;
 const FADING_STEPS: [f32; 2] = [300.0, 100.0];
 
 /// An aim, and a goal cell, which only the aim `Far` uses.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Behaviour {
     aim: Aim,
     goal: usize,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Aim {
     /// Random moves.
     Walk,
@@ -142,11 +141,6 @@ impl Behaviour {
             Aim::Exploit { entropy: 0 } => "the highest reward",
             Aim::Exploit { .. } => "the highest reward, and entropy",
         }
-    }
-
-    /// Whether the goal cell is on a grid.
-    pub fn is_of(&self, shape: Shape) -> bool {
-        self.goal < shape.n_cells()
     }
 }
 

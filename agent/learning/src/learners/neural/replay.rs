@@ -4,36 +4,32 @@
 //! A *block* contains consecutive frames of one robot. It stores the sightings before its first frame. The sightings
 //! before a later frame are computed from the stored sightings and the frames in between.
 
-use crate::checkpoint::{check, check_numbers};
-use anyhow::Result;
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, Shape};
 use emberwatch_network::{Lesson, Sightings};
 use ndarray::s;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
-use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
-use std::ops::Range;
 
 /// Maximum number of frames per block.
 const BLOCK_FRAMES: usize = 256;
 
 /// A frame: its observed cells (row-major index and value), and the corrected filter's predictions for these cells,
 /// `[cells, O]`, if there is a filter.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 struct SeenFrame {
     cells: Vec<(usize, u8)>,
     base: Vec<f32>,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 struct Block {
     before: Sightings,
     frames: Vec<SeenFrame>,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct LessonReplay {
     max_frames: usize,
     /// Blocks that are full or whose track has ended, oldest first.
@@ -66,16 +62,6 @@ impl LessonReplay {
             let oldest = self.full.pop_front();
             n_frames -= oldest.map_or(0, |block| block.frames.len());
         }
-    }
-
-    /// Ends the tracks of all robots except the given ones.
-    pub fn end_others(&mut self, robots: &Range<u32>) {
-        let open = std::mem::take(&mut self.open);
-        let (own, ended): (_, BTreeMap<_, _>) = open
-            .into_iter()
-            .partition(|(robot, _)| robots.contains(robot));
-        self.open = own;
-        self.full.extend(ended.into_values());
     }
 
     /// Adds a robot's next frame. `base` is the distribution over observations that the corrected filter predicted,
@@ -132,50 +118,6 @@ impl LessonReplay {
             None
         };
         (0..n).filter_map(|_| lesson()).collect()
-    }
-
-    /// Drops all frames and tracks.
-    pub fn forget(&mut self) {
-        *self = Self::new(self.max_frames);
-    }
-
-    /// Loads the contents of another buffer. The capacity does not change.
-    pub fn resume(&mut self, other: Self) {
-        (self.full, self.open) = (other.full, other.open);
-    }
-
-    /// Checks a buffer from a checkpoint: its grid, its observations, and that each robot has a track. If `has_base` is
-    /// set, each frame must contain a filter's predictions.
-    pub fn check(
-        &self,
-        shape: Shape,
-        n_observations: usize,
-        has_base: bool,
-        mut robots: impl Iterator<Item = u32>,
-    ) -> Result<()> {
-        let (name, expected) = (
-            "replay",
-            format!("{n_observations} observations on {shape}"),
-        );
-        for block in self.full.iter().chain(self.open.values()) {
-            let fits = block.before.are_of(shape, n_observations);
-            check(fits, name, &expected, "other sightings")?;
-            for seen in &block.frames {
-                for &(cell, value) in &seen.cells {
-                    let fits = cell < shape.n_cells() && usize::from(value) < n_observations;
-                    check(fits, name, &expected, format!("{value} in cell {cell}"))?;
-                }
-                let n = if has_base {
-                    seen.cells.len() * n_observations
-                } else {
-                    0
-                };
-                check_numbers("replay.base", &seen.base, n)?;
-            }
-        }
-        let lacking = robots.find(|robot| !self.open.contains_key(robot));
-        let got = lacking.map_or(String::new(), |robot| format!("none for robot {robot}"));
-        check(lacking.is_none(), name, "a track for each robot", got)
     }
 }
 
@@ -240,24 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn old_blocks_are_dropped_and_misfits_are_rejected() {
+    fn old_blocks_are_dropped() {
         assert_eq!(replay(1100, 1000).full.len(), 3);
-        let replay = replay(300, 1000);
-        let check = |n_observations, robots: [u32; 2]| {
-            let check = replay.check(shape(), n_observations, false, robots.into_iter());
-            check.map_err(|error| error.to_string())
-        };
-        assert_eq!(check(100, [3, 4]), Ok(()));
-        for (n_observations, robots, words) in [
-            (98, [3, 4], "replay: expected 98 observations on 2"),
-            (
-                100,
-                [4, 5],
-                "replay: expected a track for each robot, got none for robot 5",
-            ),
-        ] {
-            let error = check(n_observations, robots).expect_err(words);
-            assert!(error.starts_with(words), "{error}");
-        }
     }
 }

@@ -40,7 +40,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
     let mut config = config(basis);
     config.seed = 1;
-    let mut network = Progress::first(&worlds(), &config, &Device::Cpu).expect("a network");
+    let mut network = Progress::first(&worlds().form(), &config, &Device::Cpu).expect("a network");
     let actions = DqnShape::of_actions(network.autoencoder.shape().hidden, 4);
     let dqn = |seed| Dqn::new(DqnSettings::paper(), actions, seed);
     network.dqn = (0..1000).map(dqn).find(suits).expect("a seed that suits");

@@ -5,7 +5,6 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::correlations::{Ages, Evidence};
 use emberwatch_belief::estimation::parameters::Tables;
 use emberwatch_model::Frame;
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// Factor by which the sums decay with each frame of any world. Old frames must lose weight, because they were
@@ -13,7 +12,7 @@ use std::collections::BTreeMap;
 const KEPT: f64 = 1.0 - 1.0 / 4000.0;
 
 /// Learns the correlations of the state with the highest reward.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Neighbours {
     correlations: Correlations,
     /// The state that the correlations refer to.
@@ -23,6 +22,15 @@ pub struct Neighbours {
 }
 
 impl Neighbours {
+    /// Continues from the learned correlations of a state, without robots.
+    pub fn of(correlations: Correlations, state: usize) -> Self {
+        Self {
+            correlations,
+            state: Some(state),
+            ages: BTreeMap::new(),
+        }
+    }
+
     /// Returns the learned correlations of a state, or default values if another state's correlations were learned.
     pub fn correlations_of(&self, state: usize) -> Correlations {
         if self.state == Some(state) {
@@ -35,11 +43,6 @@ impl Neighbours {
     /// Begins an episode of a robot.
     pub fn begin(&mut self, robot: u32, n_cells: usize) {
         self.ages.insert(robot, Ages::new(n_cells));
-    }
-
-    /// Drops all robots. The learned correlations remain.
-    pub fn forget_robots(&mut self) {
-        self.ages.clear();
     }
 
     /// Adds a robot's next frame. `predictor` is the belief before the frame, or `None` for the first frame.
@@ -64,12 +67,5 @@ impl Neighbours {
             self.correlations.learn(&evidence);
         }
         frame.observed().for_each(|(index, _)| ages.see(index));
-    }
-
-    /// Whether all worlds have this number of cells.
-    pub fn are_of(&self, n_cells: usize) -> bool {
-        self.ages
-            .values()
-            .all(|ages| ages.as_slice().len() == n_cells)
     }
 }
