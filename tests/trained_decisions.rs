@@ -147,9 +147,9 @@ fn decisions_on_a_known_model_go_on_with_it() {
     let place = place();
     for out in ["out", "same"] {
         place.train(out, &format!("{WORLDS} --estimator known --steps 20"));
-        place.train(out, &format!("{WORLDS} --resume --steps 10"));
+        place.train(out, &format!("{WORLDS} --resume --steps 30"));
     }
-    assert_eq!(steps(&place, "out"), "30");
+    assert_eq!(steps(&place, "out"), "50");
     assert_eq!(saved(&place, "out"), "known");
     let is_same = place.bytes("out") == place.bytes("same");
     assert!(is_same, "checkpoints of the same training differ");
