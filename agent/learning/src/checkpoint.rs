@@ -7,7 +7,7 @@
 //! bytes, so training runs can be compared by the hashes of their checkpoints.
 
 use crate::config::AgentConfig;
-use crate::file::{Readers, replace_file};
+use crate::file::replace_file;
 use anyhow::{Context, Result, anyhow, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use emberwatch_model::text::shortened;
@@ -185,8 +185,7 @@ impl Part<'_> {
 /// If the system reports an error. An existing file then remains unchanged.
 pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
     let bytes = encode(kind, contents).with_context(|| named(path))?;
-    // Only the owner may read the file, because it contains beliefs about worlds.
-    replace_file(path, &bytes, Readers::Owner).with_context(|| named(path))
+    replace_file(path, &bytes).with_context(|| named(path))
 }
 
 /// Reads a checkpoint. Returns its kind and its contents.

@@ -1,33 +1,23 @@
 //! Files that are written completely or not at all.
 
 use anyhow::{Context, Result};
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::Write;
-#[cfg(unix)]
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-/// Who may read a file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Readers {
-    /// Everyone whom the process's umask allows.
-    Any,
-    Owner,
-}
-
-/// Writes a temporary file next to `path` and renames it, so that readers always find a complete file.
+/// Writes a temporary file next to `path` and renames it, so that readers always find a complete file. A symbolic link
+/// stays one, and its target is replaced.
 ///
 /// # Errors
 /// If the system reports an error. The error names the file, which remains unchanged.
-pub fn replace_file(path: &Path, bytes: &[u8], readers: Readers) -> Result<()> {
-    // A link stays one, and its target is replaced.
-    let path = &std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
+pub fn replace_file(path: &Path, bytes: &[u8]) -> Result<()> {
     let written = || {
-        let (temporary, mut file) = create_temporary(path, readers)?;
+        let target = target(path);
+        let (temporary, mut file) = create_temporary(&target)?;
         let written = file
             .write_all(bytes)
             .and_then(|()| file.sync_all())
-            .and_then(|()| std::fs::rename(&temporary, path));
+            .and_then(|()| std::fs::rename(&temporary, &target));
         if written.is_err() {
             // Only the first error is reported.
             let _ = std::fs::remove_file(&temporary);
@@ -43,25 +33,22 @@ pub fn replace_file(path: &Path, bytes: &[u8], readers: Readers) -> Result<()> {
 /// # Errors
 /// If the temporary file cannot be created. The error names the file and the system's reason.
 pub fn check_replaceable(path: &Path) -> Result<()> {
-    let created = create_temporary(path, Readers::Owner);
+    let created = create_temporary(&target(path));
     let checked = created.and_then(|(temporary, _)| Ok(std::fs::remove_file(temporary)?));
     checked.with_context(|| format!("write {}", path.display()))
 }
 
-fn create_temporary(path: &Path, readers: Readers) -> Result<(PathBuf, File)> {
+/// Follows symbolic links.
+fn target(path: &Path) -> PathBuf {
+    std::fs::canonicalize(path).unwrap_or_else(|_| path.into())
+}
+
+fn create_temporary(path: &Path) -> Result<(PathBuf, File)> {
     let name = path.file_name().context("expected the name of a file")?;
     let name = format!(".{}.{}", name.display(), std::process::id());
     let temporary = path.with_file_name(name);
     // An earlier process with the same ID may have left a file with different permissions.
     let _ = std::fs::remove_file(&temporary);
-    let mut options = OpenOptions::new();
-    options.write(true).create_new(true);
-    #[cfg(unix)]
-    if readers == Readers::Owner {
-        options.mode(0o600);
-    }
-    #[cfg(not(unix))]
-    let _ = readers; // The folder determines who may read the file.
-    let file = options.open(&temporary)?;
+    let file = File::create_new(&temporary)?;
     Ok((temporary, file))
 }

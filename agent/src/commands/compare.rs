@@ -17,7 +17,7 @@ use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
 
 use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::file::{Readers, replace_file};
+use emberwatch_learning::file::replace_file;
 use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners;
 use emberwatch_learning::policy::{self, Goal, LearnedDecisions, Policy};
@@ -308,7 +308,7 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     draw_teams(&directory.join("teams.svg"), all, label)?;
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
-    replace_file(&path, settings.as_bytes(), Readers::Any)
+    replace_file(&path, settings.as_bytes())
 }
 
 /// Returns one policy per option, the rule and the learned choice, all on the belief of the learned decisions.

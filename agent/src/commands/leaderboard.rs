@@ -8,7 +8,7 @@ use crate::benchmark::report::leaderboard_chart::draw_leaderboard;
 use crate::benchmark::report::runs_file::{file_of, read_tasks};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_learning::file::{Readers, replace_file};
+use emberwatch_learning::file::replace_file;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -46,7 +46,7 @@ impl LeaderboardCommand {
             format!("{page}: expected a line {MADE} (the text below it is generated), got none")
         })?;
         let text = format!("{kept}{MADE}\n\n{table}");
-        replace_file(&self.page, text.as_bytes(), Readers::Any)?;
+        replace_file(&self.page, text.as_bytes())?;
         draw_leaderboard(&self.page.with_extension("svg"), &all_runs(&entries))?;
         write(&table)
     }

@@ -1,7 +1,7 @@
 //! Processor seconds of a training, kept in a file in its folder.
 
 use anyhow::{Context, Result, ensure};
-use emberwatch_learning::file::{Readers, replace_file};
+use emberwatch_learning::file::replace_file;
 use rustix::time::{ClockId, clock_gettime};
 use std::path::{Path, PathBuf};
 
@@ -32,7 +32,7 @@ impl Stopwatch {
             return Ok(());
         };
         let text = format!("{:.1}\n", before + processor_seconds() - self.start);
-        replace_file(&self.path, text.as_bytes(), Readers::Any)
+        replace_file(&self.path, text.as_bytes())
     }
 }
 

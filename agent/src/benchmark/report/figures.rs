@@ -8,7 +8,7 @@ use crate::benchmark::report::teams::teams;
 use crate::charts::{Bar, Ladder, Point, RGBColor};
 use anyhow::{Result, bail, ensure};
 use emberwatch_learning::beliefs::{self, LEARNED};
-use emberwatch_learning::file::{Readers, replace_file};
+use emberwatch_learning::file::replace_file;
 use emberwatch_learning::policy;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -35,7 +35,7 @@ impl Estimate {
 
 /// Writes an SVG page to `path`.
 pub fn save(path: &Path, svg: &str) -> Result<()> {
-    replace_file(path, svg.as_bytes(), Readers::Any)
+    replace_file(path, svg.as_bytes())
 }
 
 /// Draws the mean reward per policy, the best at the top. `axis_label` names what the reward counts, such as

@@ -9,7 +9,7 @@ use crate::benchmark::report::suite::{
 };
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_learning::file::{Readers, replace_file};
+use emberwatch_learning::file::replace_file;
 use emberwatch_protocol::task::is_file_name;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -123,7 +123,7 @@ impl Entry {
             let scores = (run.mean_reward, run.brier, run.log_likelihood);
             writer.serialize((&self.about, what, who, scores, &run.worlds_fingerprint))?;
         }
-        replace_file(path, &writer.into_inner()?, Readers::Any)
+        replace_file(path, &writer.into_inner()?)
     }
 
     /// Sets the seconds of training from the rows of `suite`, unless they are known or a task's rows have none.

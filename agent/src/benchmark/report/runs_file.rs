@@ -2,7 +2,7 @@
 
 use crate::benchmark::report::policy_run::PolicyRun;
 use anyhow::{Context, Result, ensure};
-use emberwatch_learning::file::{Readers, check_replaceable, replace_file};
+use emberwatch_learning::file::{check_replaceable, replace_file};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ pub fn check_runs_file(path: &Path) -> Result<()> {
         "write {}: expected a regular file, got a folder or device",
         path.display()
     );
-    check_replaceable(&target(path))
+    check_replaceable(path)
 }
 
 /// Writes one row per run, ordered by policy, then seed. A missing value is an empty field.
@@ -27,7 +27,7 @@ pub fn write_runs(path: &Path, runs: &[PolicyRun]) -> Result<()> {
     });
     let mut writer = csv::Writer::from_writer(Vec::new());
     sorted.iter().try_for_each(|run| writer.serialize(run))?;
-    replace_file(&target(path), &writer.into_inner()?, Readers::Any)
+    replace_file(path, &writer.into_inner()?)
 }
 
 /// Reads the runs of a CSV file that `compare --csv`, `suite` or `emberwatch.benchmark` wrote.
@@ -80,9 +80,4 @@ pub fn file_of(policy: &str) -> String {
 /// Returns [`file_of`] without its ending.
 pub fn file_stem(policy: &str) -> String {
     policy.replace(['/', '+'], "_")
-}
-
-/// Returns the file behind a symbolic link, which is replaced instead of the link.
-fn target(path: &Path) -> PathBuf {
-    path.canonicalize().unwrap_or_else(|_| path.to_owned())
 }
