@@ -8,12 +8,10 @@ use crate::flags::{AgentFlags, Preset, one_of, one_of_names};
 use crate::training::{CHECKPOINT, TrainingSpec, train};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_learning::beliefs::{self, BeliefKind, LEARNED};
+use emberwatch_learning::beliefs::{self, BeliefKind};
 use emberwatch_learning::checkpoint::Contents;
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::learned::Learned;
-use emberwatch_learning::learners::decisions::{SavedDecisions, belief_of};
-use emberwatch_learning::learners::filter::FILTER;
 use emberwatch_learning::learners::{self, LEARNERS, LearnerKind};
 use emberwatch_network::{Device, DeviceKind};
 use emberwatch_protocol::channels::{Instance, MAX_WORLDS};
@@ -129,12 +127,8 @@ impl TrainCommand {
             config.decisions.estimator = estimator.name.into();
         }
         let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
+        self.check_flags(kind)?;
         if let Some(full_frames) = self.full_frames {
-            ensure!(
-                *kind == FILTER,
-                "--coverage applies only with --learner filter, got --learner {}",
-                kind.name
-            );
             config.full_frames = full_frames;
         }
         let n_worlds = self
@@ -163,74 +157,94 @@ impl TrainCommand {
         })
     }
 
-    /// Reads the belief that decisions are based on, or the filter that a network corrects. Refuses flags that would be
-    /// ignored.
+    /// Refuses flags that the learner would ignore.
+    fn check_flags(&self, kind: &LearnerKind) -> Result<()> {
+        for (flag, is_given) in [
+            ("coverage", self.full_frames.is_some()),
+            ("estimator", self.estimator.is_some()),
+            ("checkpoint", self.checkpoint.is_some()),
+        ] {
+            let with = LEARNERS.iter().filter(|other| other.flags.contains(&flag));
+            let with: Vec<&str> = with.map(|other| other.name).collect();
+            ensure!(
+                !is_given || kind.flags.contains(&flag),
+                "--{flag} applies only with --learner {}, got --learner {}",
+                with.join(" or "),
+                kind.name
+            );
+        }
+        Ok(())
+    }
+
+    /// Reads the belief that the learner builds on.
     fn learned(
         &self,
         kind: &LearnerKind,
         config: &AgentConfig,
         device: &Device,
     ) -> Result<Learned> {
-        let (is_neural, decides) = (*kind == learners::neural::NEURAL, decides(kind));
-        ensure!(
-            self.estimator.is_none() || decides,
-            "--estimator applies only with --learner decisions, got --learner {}",
-            kind.name
+        let (base, learned) = (
+            (kind.base)(config)?,
+            learners::read(self.checkpoint.as_deref(), device)?,
         );
-        ensure!(
-            self.checkpoint.is_none() || decides || is_neural,
-            "--checkpoint applies only with --learner decisions or neural, got --learner {}",
-            kind.name
-        );
-        let belief = if is_neural {
-            &LEARNED
-        } else {
-            belief_of(&config.decisions.estimator)?
-        };
-        let learned = learners::read(self.checkpoint.as_deref(), device)?;
-        if let Some(path) = &self.checkpoint {
+        if let Some((path, base)) = self.checkpoint.as_ref().zip(base) {
             ensure!(
-                matches!(belief.learned(&learned), Ok(Some(_))),
+                matches!(base.learned(&learned), Ok(Some(_))),
                 "--checkpoint {}: expected a checkpoint for the estimator {}, got one of another kind",
                 path.display(),
-                belief.name
+                base.name
             );
         }
         Ok(learned)
     }
 
-    /// Returns the checkpoint to resume, and adopts the settings that it determines. Returns `None` without `--resume`,
-    /// or if a training of decisions was interrupted while it still trained the belief.
+    /// Returns the contents of the checkpoint to resume, and adopts the settings that it determines. Returns `None`
+    /// without `--resume`, or if a training was interrupted while it still trained its belief.
     fn contents(&self, training: &mut TrainingSpec) -> Result<Option<Contents>> {
-        let kind = training.learner()?;
-        if decides(kind)
-            && self.resume
-            && let Some((belief, done)) = training.adopt_belief()?
-        {
-            self.adopt_estimator(belief, training)?;
-            training.first_seed = Some(self.next_seed(done));
-            return Ok(None);
+        if !self.resume {
+            return training.check();
         }
-        let contents = training.check()?;
-        if let Some(contents) = &contents {
-            self.check_no_checkpoint()?;
-            (kind.adopt)(contents, &mut training.config);
-            let (expected, got) = (training.config.full_frames, self.full_frames);
+        let done = training.adopt_belief()?;
+        let contents = match done {
+            Some(_) => None,
+            None => training.check()?,
+        };
+        let kind = training.learner()?;
+        let done = match &contents {
+            Some(contents) => {
+                (kind.adopt)(contents, &mut training.config)?;
+                let done = (kind.done)(contents)?;
+                self.limit_steps(done, training)?;
+                done
+            }
+            None => done.unwrap_or(0),
+        };
+        self.check_adopted(&training.config)?;
+        training.first_seed = Some(self.next_seed(done));
+        Ok(contents)
+    }
+
+    /// Refuses flags that differ from the settings of the checkpoint to resume.
+    fn check_adopted(&self, adopted: &AgentConfig) -> Result<()> {
+        let coverage = |full_frames: bool| COVERAGES[usize::from(full_frames)].1;
+        let estimator = self.estimator.map(|kind| kind.name);
+        let given = self.full_frames.map(coverage);
+        for (flag, got, expected) in [
+            ("coverage", given, coverage(adopted.full_frames)),
+            ("estimator", estimator, &adopted.decisions.estimator),
+        ] {
             ensure!(
                 got.is_none_or(|got| got == expected),
-                "--coverage: expected {} as in the checkpoint, got {}",
-                COVERAGES[usize::from(expected)].1,
-                COVERAGES[usize::from(!expected)].1
+                "--{flag}: expected {expected} as in the checkpoint, got {}",
+                got.unwrap_or_default()
             );
-            if decides(kind) {
-                let belief = contents.state::<SavedDecisions>()?.kind()?;
-                self.adopt_estimator(belief, training)?;
-            }
-            let done = (kind.done)(contents)?;
-            self.limit_steps(done, training)?;
-            training.first_seed = Some(self.next_seed(done));
         }
-        Ok(contents)
+        ensure!(
+            self.checkpoint.is_none(),
+            "--checkpoint cannot be combined with --resume, which continues with the belief in {}",
+            self.out.display()
+        );
+        Ok(())
     }
 
     /// Returns the seed of the first world of a resumed training, which depends on the number of world steps done.
@@ -249,33 +263,6 @@ impl TrainCommand {
                 "--steps: expected a number of steps, as all {all} steps of the settings are done"
             );
         }
-        Ok(())
-    }
-
-    /// Adopts the checkpoint's estimator. Returns an error if `--estimator` differs.
-    fn adopt_estimator(
-        &self,
-        expected: &'static BeliefKind,
-        training: &mut TrainingSpec,
-    ) -> Result<()> {
-        let got = self.estimator.unwrap_or(expected);
-        ensure!(
-            got == expected,
-            "--estimator: expected {} as in the checkpoint, got {}",
-            expected.name,
-            got.name
-        );
-        self.check_no_checkpoint()?;
-        training.config.decisions.estimator = expected.name.into();
-        Ok(())
-    }
-
-    fn check_no_checkpoint(&self) -> Result<()> {
-        ensure!(
-            self.checkpoint.is_none(),
-            "--checkpoint cannot be combined with --resume, which continues with the belief in {}",
-            self.out.display()
-        );
         Ok(())
     }
 
@@ -313,19 +300,15 @@ impl TrainCommand {
 /// Starts to simulate worlds for a training.
 pub(super) fn simulate(mut settings: Checked, training: &TrainingSpec) -> Result<Worlds> {
     // A learner that learns a model must not see the true model.
-    let reveals = decides(training.learner()?) && training.belief()?.knows_model;
-    settings.config.reveal_model = reveals;
+    settings.config.reveal_model = training.base()?.is_some_and(|base| base.knows_model);
     settings.config.coverage = CoverageRule::Client;
     Worlds::simulate(settings.with_worlds(training.worlds.len() as u32)?)
 }
 
-fn decides(kind: &LearnerKind) -> bool {
-    *kind == learners::decisions::DECISIONS
-}
-
-/// Returns whether a training of decisions must first train their belief.
+/// Returns whether the belief that the learner builds on must be trained first.
 fn needs_belief(training: &TrainingSpec) -> Result<bool> {
-    Ok(decides(training.learner()?) && training.belief()?.learned(&training.learned).is_err())
+    let is_missing = |base: &BeliefKind| base.learned(&training.learned).is_err();
+    Ok(training.learner()?.needs_base && training.base()?.is_some_and(is_missing))
 }
 
 /// Trains the belief that decisions are based on, unless its training is complete.

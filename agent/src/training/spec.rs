@@ -71,17 +71,16 @@ impl TrainingSpec {
         learners::named(&self.config.learner).map_err(anyhow::Error::msg)
     }
 
-    /// Returns the belief that decisions are learned on.
-    pub fn belief(&self) -> Result<&'static BeliefKind> {
-        belief_of(&self.config.decisions.estimator)
+    /// Returns the belief that the learner builds on, if any.
+    pub fn base(&self) -> Result<Option<&'static BeliefKind>> {
+        (self.learner()?.base)(&self.config)
     }
 
-    /// Returns the training of the belief that decisions are learned on, in a subfolder. Returns `None` if that
-    /// training is complete, or if the belief needs none.
+    /// Returns the training of the belief that the learner builds on, in a subfolder. Returns `None` if that training
+    /// is complete, or if the belief needs none.
     pub fn belief_training(&self) -> Result<Option<Self>> {
-        let Some(by) = &self.belief()?.learned_by else {
-            return Ok(None);
-        };
+        let by = self.base()?.and_then(|base| base.learned_by.as_ref());
+        let Some(by) = by else { return Ok(None) };
         let mut belief = self.clone();
         belief.out = self.belief_folder();
         belief.config.learner = by.learner.into();
@@ -96,11 +95,11 @@ impl TrainingSpec {
         Ok((belief.steps > 0).then_some(belief))
     }
 
-    /// Returns the belief that was being trained when a training of decisions was interrupted, and the number of world
-    /// steps done. Adopts the settings that the belief's checkpoint determines.
-    pub fn adopt_belief(&mut self) -> Result<Option<(&'static BeliefKind, u64)>> {
+    /// If the training was interrupted while its belief was trained, adopts the settings that the belief's checkpoint
+    /// determines, and returns the number of world steps done.
+    pub fn adopt_belief(&mut self) -> Result<Option<u64>> {
         let place = self.belief_folder().join(CHECKPOINT);
-        if self.out.join(CHECKPOINT).exists() || !place.exists() {
+        if !self.learner()?.needs_base || self.out.join(CHECKPOINT).exists() || !place.exists() {
             return Ok(None);
         }
         let (_, contents) = checkpoint::read(&place)?;
@@ -112,8 +111,9 @@ impl TrainingSpec {
             return Ok(None);
         };
         let learner = learners::named(by.learner).map_err(anyhow::Error::msg)?;
-        (learner.adopt)(&contents, &mut self.config);
-        Ok(Some((belief, (learner.done)(&contents)?)))
+        (learner.adopt)(&contents, &mut self.config)?;
+        self.config.decisions.estimator = belief.name.into();
+        (learner.done)(&contents).map(Some)
     }
 
     /// Returns the folder of [`Self::belief_training`].

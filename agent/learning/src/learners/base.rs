@@ -1,7 +1,7 @@
 //! The interface of all learners, and their inputs.
 
 use super::update::ModelUpdate;
-use crate::beliefs::WorldForm;
+use crate::beliefs::{BeliefKind, WorldForm};
 use crate::checkpoint::Contents;
 use crate::config::AgentConfig;
 use crate::learned::Learned;
@@ -29,6 +29,12 @@ pub struct LearnerKind {
     pub columns: &'static [&'static str],
     /// Whether it supports only a single robot in a single world.
     pub is_single: bool,
+    /// The flags of `train` that apply to it and not to every learner, without `--`.
+    pub flags: &'static [&'static str],
+    /// Returns the belief that it builds on, if any.
+    pub base: fn(&AgentConfig) -> Result<Option<&'static BeliefKind>>,
+    /// Whether it needs a base.
+    pub needs_base: bool,
     /// Returns the default number of world steps of a training run. 0 means that it runs until stopped.
     pub steps: fn(&AgentConfig) -> u64,
     /// Returns the number of steps per episode on a server that `train` starts. `None` means endless episodes.
@@ -36,7 +42,7 @@ pub struct LearnerKind {
     /// Returns the number of world steps that the learner of a checkpoint has learned from.
     pub done: fn(&Contents) -> Result<u64>,
     /// When a run resumes a checkpoint, copies the settings that the checkpoint determines into the run's settings.
-    pub adopt: fn(&Contents, &mut AgentConfig),
+    pub adopt: fn(&Contents, &mut AgentConfig) -> Result<()>,
     /// Loads from a checkpoint the values that policies use. Returns whether it replaced a different value.
     pub read: fn(&Contents, &Device, &mut Learned) -> Result<bool>,
     /// Creates a learner, or resumes one from a checkpoint.

@@ -31,10 +31,16 @@ pub const DECISIONS: LearnerKind = LearnerKind {
     checkpoint: "decisions",
     columns: &["dqn_loss", "dqn_rate", "epsilon"],
     is_single: false,
+    flags: &["checkpoint", "estimator"],
+    base: |config| belief_of(&config.decisions.estimator).map(Some),
+    needs_base: true,
     steps: |config| config.decisions.steps,
     episode_steps: |config| Some(config.decisions.episode_steps),
     done: |contents| Ok(contents.state::<SavedDecisions>()?.world_steps),
-    adopt: |_, _| (),
+    adopt: |contents, config| {
+        config.decisions.estimator = contents.state::<SavedDecisions>()?.estimator;
+        Ok(())
+    },
     read: saved::read,
     begin,
 };

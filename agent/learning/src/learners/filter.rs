@@ -41,13 +41,15 @@ pub const FILTER: LearnerKind = LearnerKind {
     checkpoint: "learned_filter",
     columns: &[],
     is_single: false,
+    flags: &["coverage"],
+    base: |_| Ok(None),
+    needs_base: false,
     steps: |_| 0,
     episode_steps: |_| None,
     done: |contents| Ok(contents.state::<SavedFilter>()?.world_steps),
     adopt: |contents, config| {
-        if let Ok(settings) = contents.settings() {
-            config.full_frames = settings.full_frames;
-        }
+        config.full_frames = contents.settings()?.full_frames;
+        Ok(())
     },
     read: |contents, _, learned| {
         let model = contents.state::<SavedFilter>()?.model;

@@ -31,10 +31,13 @@ pub const AUTOENCODER: LearnerKind = LearnerKind {
     checkpoint: "autoencoder",
     columns: &["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"],
     is_single: true,
+    flags: &[],
+    base: |_| Ok(None),
+    needs_base: false,
     steps: |_| 0,
     episode_steps: |_| None,
     done: |contents| Ok(contents.state::<SavedNetwork>()?.iterations),
-    adopt: |_, _| {},
+    adopt: |_, _| Ok(()),
     read: |contents, device, learned| {
         Ok(learned.put(Progress::read(contents, device)?.into_model()))
     },

@@ -13,7 +13,7 @@ use self::behaviour::Behaviour;
 use self::replay::LessonReplay;
 use crate::beliefs::learned::LearnedModel;
 use crate::beliefs::neural::{NeuralModel, SavedNeuralModel, corrected_tensors, estimator};
-use crate::beliefs::{LearnedBelief, NEURAL as BELIEF, numbered_states};
+use crate::beliefs::{LEARNED, LearnedBelief, NEURAL as BELIEF, numbered_states};
 use crate::checkpoint::{Contents, check, check_counts};
 use crate::config::AgentConfig;
 use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, lacks_steps, replace};
@@ -34,10 +34,13 @@ pub const NEURAL: LearnerKind = LearnerKind {
     checkpoint: "neural_belief",
     columns: &[],
     is_single: false,
+    flags: &["checkpoint"],
+    base: |_| Ok(Some(&LEARNED)),
+    needs_base: false,
     steps: |config| config.neural.steps,
     episode_steps: |config| Some(config.neural.episode_steps),
     done: |contents| Ok(contents.state::<SavedNeural>()?.world_steps),
-    adopt: |_, _| {},
+    adopt: |_, _| Ok(()),
     read: |contents, device, learned| {
         let model = contents.state::<SavedNeural>()?.model;
         Ok(learned.put(model.read(&contents.part(""), device)?))
