@@ -1,6 +1,6 @@
 //! Tests that invalid input to any command leads to an exit code and a one-line error, never to a panic.
 
-use emberwatch_learning::policy;
+use emberwatch_acting::policy;
 use std::time::{Duration, Instant};
 use tests::harness::{AGENT, Ended, LIMIT, Program, SERVER, SMALL, Server, new_instance, run};
 

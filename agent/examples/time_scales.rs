@@ -3,9 +3,9 @@
 //!
 //! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.svg`
 
+use emberwatch_acting::config::{AgentConfig, StepSize};
 use emberwatch_agent::benchmark::report::save;
 use emberwatch_agent::charts::{Curve, Lines, Panel, Point, Scale};
-use emberwatch_learning::config::{AgentConfig, StepSize};
 use std::path::Path;
 
 const ITERATIONS: u64 = 25_000;

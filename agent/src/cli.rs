@@ -3,7 +3,7 @@
 use crate::commands;
 use crate::process::set_up_process;
 use clap::{Parser, Subcommand};
-use emberwatch_learning::policy;
+use emberwatch_acting::policy;
 use emberwatch_protocol::limits::threads::NoThreads;
 use emberwatch_protocol::program::{parse_flags, start_logging};
 use rayon::ThreadPoolBuilder;

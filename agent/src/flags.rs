@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, bail};
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
-use emberwatch_learning::config::{AgentConfig, PriorKind};
+use emberwatch_acting::config::{AgentConfig, PriorKind};
 use emberwatch_learning::learners;
 use emberwatch_learning::learners::decisions::belief_of;
 use emberwatch_protocol::program::read_text;

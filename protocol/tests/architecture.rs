@@ -8,13 +8,14 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources. Each folder in them that contains source files is a layer.
-const SOURCES: [&str; 15] = [
+const SOURCES: [&str; 16] = [
     "protocol/src",
     "protocol/messages/src",
     "protocol/model/src",
     "env-server/src",
     "env-server/sim/src",
     "agent/src",
+    "agent/acting/src",
     "agent/belief/src",
     "agent/gradient/src",
     "agent/learning/src",
@@ -159,7 +160,13 @@ fn the_readme_shows_the_example_of_the_crate() {
 #[test]
 fn layers_use_only_those_below_them() {
     let layers = layers();
-    for name in ["agent", "agent/learning", "env-server", "env-server/sim"] {
+    for name in [
+        "agent",
+        "agent/acting",
+        "agent/learning",
+        "env-server",
+        "env-server/sim",
+    ] {
         let place = |module: &[String]| {
             let layer = format!("{name}/src/{}", module.first()?);
             layers.iter().position(|name| *name == layer)
@@ -177,10 +184,12 @@ fn layers_use_only_those_below_them() {
 #[test]
 fn pure_crates_need_no_channels_and_no_flags() {
     let pure = ["protocol/model", "protocol/messages", "env-server/sim"];
-    for name in pure
-        .into_iter()
-        .chain(["agent/belief", "agent/gradient", "agent/learning"])
-    {
+    for name in pure.into_iter().chain([
+        "agent/acting",
+        "agent/belief",
+        "agent/gradient",
+        "agent/learning",
+    ]) {
         let manifest = std::fs::read_to_string(root().join(name).join("Cargo.toml"));
         let manifest = manifest.expect("a manifest");
         for other in ["iceoryx2", "clap", "tokio", "emberwatch-protocol"] {

@@ -5,15 +5,15 @@
 //! each step. Run it with `cargo run --release -p tests --example own_belief`.
 
 use anyhow::Result;
+use emberwatch_acting::beliefs::{BeliefKind, Conditions, Input};
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::policy::{BEAM, Goal, Policy};
+use emberwatch_acting::rollout::{Rollout, building, step};
+use emberwatch_acting::served::Served;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::bayes::correct;
 use emberwatch_belief::estimation::{Estimator, EstimatorError};
-use emberwatch_learning::beliefs::{BeliefKind, Conditions, Input};
-use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::{BEAM, Goal, Policy};
-use emberwatch_learning::rollout::{Rollout, building, step};
-use emberwatch_learning::served::Served;
 use emberwatch_protocol::client::{Claim, Client};
 use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_protocol::{Frame, Model};

@@ -1,10 +1,10 @@
 //! Duration of updates at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use emberwatch_acting::config::AgentConfig;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
-use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::gradient::Optimiser;
 use emberwatch_learning::replay::BlockReplay;
 use emberwatch_model::path::fly;

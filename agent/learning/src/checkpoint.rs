@@ -6,10 +6,10 @@
 //! records its kind of learner and its format, and contains a digest that reveals damage. Equal contents produce equal
 //! bytes, so training runs can be compared by the hashes of their checkpoints.
 
-use crate::config::AgentConfig;
 use crate::file::replace_file;
 use anyhow::{Context, Result, anyhow, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
+use emberwatch_acting::config::AgentConfig;
 use emberwatch_model::text::shortened;
 use emberwatch_network::NamedTensor;
 use safetensors::tensor::TensorView;

@@ -16,8 +16,8 @@ pub use self::base::{Beginning, Learner, LearnerKind, Worlds};
 pub use self::update::ModelUpdate;
 
 use crate::checkpoint::{self, Contents};
-use crate::learned::Learned;
 use anyhow::{Context, Result, ensure};
+use emberwatch_acting::learned::Learned;
 use emberwatch_model::built_in::listed;
 use emberwatch_model::text::shortened;
 use emberwatch_network::Device;

@@ -1,9 +1,9 @@
 //! Tests of the learned filter: equality with the known-model filter, and training.
 
+use emberwatch_acting::config::{AgentConfig, LearningConfig};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
-use emberwatch_learning::config::{AgentConfig, LearningConfig};
 use emberwatch_learning::gradient::{Optimiser, Update};
 use emberwatch_learning::replay::BlockReplay;
 use emberwatch_model::randomness::split_mix;

@@ -3,8 +3,8 @@
 
 use crate::client::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
-use emberwatch_learning::beliefs::Input;
-use emberwatch_learning::rollout::{Rollout, Seen};
+use emberwatch_acting::beliefs::Input;
+use emberwatch_acting::rollout::{Rollout, Seen};
 use emberwatch_protocol::Client;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::message::Status;

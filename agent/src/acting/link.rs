@@ -2,7 +2,7 @@
 
 use crate::client::truth::TruthFeed;
 use anyhow::Result;
-use emberwatch_learning::rollout::{Environment, Seen};
+use emberwatch_acting::rollout::{Environment, Seen};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::{Client, Move};

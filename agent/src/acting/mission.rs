@@ -3,9 +3,9 @@
 use crate::acting::team::Team;
 use crate::client::info::connect;
 use anyhow::{Result, bail, ensure};
-use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::Policy;
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::policy::Policy;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::Claim;

@@ -7,18 +7,18 @@ use crate::benchmark::report::common_worlds::World;
 use crate::benchmark::world_run::WorldRun;
 use crate::client::view::view;
 use anyhow::{Context, Result, ensure};
+use emberwatch_acting::beliefs::first_belief::first_belief;
+use emberwatch_acting::beliefs::{Conditions, Input, WorldForm};
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::parallel::in_parallel;
+use emberwatch_acting::policy::Policy;
+use emberwatch_acting::rollout::{
+    self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
+};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Plan;
 use emberwatch_belief::planning::team::robot_seed;
-use emberwatch_learning::beliefs::first_belief::first_belief;
-use emberwatch_learning::beliefs::{Conditions, Input, WorldForm};
-use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learned::Learned;
-use emberwatch_learning::parallel::in_parallel;
-use emberwatch_learning::policy::Policy;
-use emberwatch_learning::rollout::{
-    self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
-};
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::feed::Feed;
 use emberwatch_protocol::{Model, Move};

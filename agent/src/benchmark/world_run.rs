@@ -2,13 +2,13 @@
 
 use crate::acting::team::Team;
 use crate::benchmark::report::PolicyRun;
+use emberwatch_acting::beliefs::Input;
+use emberwatch_acting::policy::Policy;
+use emberwatch_acting::rollout::Rollout;
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::{Found, MeritTally, RECENT_STEPS};
 use emberwatch_belief::planning::Plan;
-use emberwatch_learning::beliefs::Input;
-use emberwatch_learning::policy::Policy;
-use emberwatch_learning::rollout::Rollout;
 use emberwatch_protocol::Shape;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::path::Flight;

@@ -1,6 +1,6 @@
 //! The view of an agent that is published to observers.
 
-use emberwatch_learning::rollout::Rollout;
+use emberwatch_acting::rollout::Rollout;
 use emberwatch_protocol::feed::View;
 use std::ops::Range;
 use std::time::Duration;

@@ -16,11 +16,11 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
 
-use emberwatch_learning::config::AgentConfig;
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::policy::{self, Goal, LearnedDecisions, Policy};
 use emberwatch_learning::file::replace_file;
-use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners;
-use emberwatch_learning::policy::{self, Goal, LearnedDecisions, Policy};
 use emberwatch_network::DeviceKind;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::control::ServerInfo;

@@ -2,8 +2,8 @@
 
 use crate::client::view::view;
 use anyhow::Result;
+use emberwatch_acting::rollout::{Actor, Seen, StepRecord};
 use emberwatch_learning::learners::{Learner, LearnerKind};
-use emberwatch_learning::rollout::{Actor, Seen, StepRecord};
 use emberwatch_protocol::Move;
 use emberwatch_protocol::client::{Backend, Client};
 use emberwatch_protocol::feed::Feed;

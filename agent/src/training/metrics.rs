@@ -2,9 +2,9 @@
 
 use anyhow::{Context, Result, ensure};
 use csv::StringRecord;
+use emberwatch_acting::rollout::StepRecord;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_learning::learners::ModelUpdate;
-use emberwatch_learning::rollout::StepRecord;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 

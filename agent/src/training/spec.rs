@@ -1,10 +1,10 @@
 //! The specification of a training, and the error of a training that ended early.
 
 use anyhow::{Context, Result, anyhow, ensure};
-use emberwatch_learning::beliefs::BeliefKind;
+use emberwatch_acting::beliefs::BeliefKind;
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
 use emberwatch_learning::checkpoint::{self, Contents};
-use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners::decisions::belief_of;
 use emberwatch_learning::learners::{self, Learner, LearnerKind};
 use emberwatch_network::Device;

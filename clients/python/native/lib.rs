@@ -28,7 +28,7 @@ mod threads;
 mod windows;
 mod wire;
 
-use emberwatch_learning::beliefs::RECOMMENDED;
+use emberwatch_acting::beliefs::RECOMMENDED;
 use emberwatch_messages::interrupt::interrupt_when;
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::maps::{MAX_ARCHIVE_BYTES, MAX_MAP_VALUES};

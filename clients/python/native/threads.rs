@@ -1,6 +1,6 @@
 //! A thread pool for work on several worlds at once.
 
-use emberwatch_learning::parallel::in_parallel;
+use emberwatch_acting::parallel::in_parallel;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 /// A thread pool that belongs to one object. A global pool would be unusable after a fork, which copies no threads.

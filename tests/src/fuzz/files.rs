@@ -1,19 +1,19 @@
 //! Fuzz targets for models and checkpoints.
 
 use super::messages::Seed;
+use emberwatch_acting::beliefs::LEARNED;
+use emberwatch_acting::beliefs::learned::LearnedModel;
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::policy::LearnedDecisions;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
-use emberwatch_learning::beliefs::LEARNED;
-use emberwatch_learning::beliefs::learned::LearnedModel;
 use emberwatch_learning::checkpoint::{Contents, WrongDigest, decode, encode};
-use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learned::Learned;
 use emberwatch_learning::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use emberwatch_learning::learners::filter::fit::FilterFit;
 use emberwatch_learning::learners::network::SavedNetwork;
 use emberwatch_learning::learners::{self, Learner, Worlds};
-use emberwatch_learning::policy::LearnedDecisions;
 use emberwatch_learning::reward::RewardEstimate;
 use emberwatch_network::Device;
 use emberwatch_protocol::model::ModelFile;

@@ -5,10 +5,10 @@
 //! window starts from a belief that depends on the earlier frames, but gradients reach back only to the start of the
 //! window.
 
-use crate::config::LearningConfig;
 use crate::gradient::adam::Adam;
 use crate::replay::{Block, BlockReplay};
 use anyhow::{Result, anyhow};
+use emberwatch_acting::config::LearningConfig;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_gradient::{Outcome, Recursion};
 use emberwatch_model::Shape;

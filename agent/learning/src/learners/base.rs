@@ -1,14 +1,14 @@
 //! The interface of all learners, and their inputs.
 
 use super::update::ModelUpdate;
-use crate::beliefs::{BeliefKind, WorldForm};
 use crate::checkpoint::Contents;
-use crate::config::AgentConfig;
-use crate::learned::Learned;
-use crate::policy::Policy;
-use crate::rollout::agent::{Agent, Chooser, Setup};
-use crate::rollout::{Actor, Rollout, Seen};
 use anyhow::Result;
+use emberwatch_acting::beliefs::{BeliefKind, WorldForm};
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::policy::Policy;
+use emberwatch_acting::rollout::agent::{Agent, Chooser, Setup};
+use emberwatch_acting::rollout::{Actor, Rollout, Seen};
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::observation::Observation;

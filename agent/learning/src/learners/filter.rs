@@ -6,17 +6,17 @@ mod saved;
 
 pub use self::saved::SavedFilter;
 
-use crate::beliefs::learned::LearnedModel;
-use crate::beliefs::{LEARNED, numbered_states};
 use crate::checkpoint::Contents;
-use crate::config::AgentConfig;
 use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, replace};
 use crate::learners::filter::fit::FilterFit;
 use crate::learners::update::ModelUpdate;
-use crate::parallel::in_parallel;
-use crate::policy::Policy;
-use crate::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use anyhow::{Result, ensure};
+use emberwatch_acting::beliefs::learned::LearnedModel;
+use emberwatch_acting::beliefs::{LEARNED, numbered_states};
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::parallel::in_parallel;
+use emberwatch_acting::policy::Policy;
+use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;

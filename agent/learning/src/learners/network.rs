@@ -3,7 +3,7 @@
 //!
 //! An iteration computes `h_{k+1}` and the predictor `u_{k+1}` from the frame (eq. 9), the estimate `p_k` by Bayes'
 //! rule (eq. 10), an action from `h` (eq. 17), and a path for it (eq. 15). After the path's frame and reward, Adam
-//! makes one step on each network (eq. 19). Each network has its own step size ([`crate::config::StepSize`]).
+//! makes one step on each network (eq. 19). Each network has its own step size ([`emberwatch_acting::config::StepSize`]).
 
 mod progress;
 
@@ -12,15 +12,15 @@ pub use self::progress::{Progress, SavedNetwork};
 use anyhow::{Result, ensure};
 use emberwatch_messages::control::{CoverageRule, ServerInfo};
 
-use crate::beliefs::autoencoder::AutoencoderEstimator;
-use crate::beliefs::numbered_states;
 use crate::checkpoint::Contents;
-use crate::config::AgentConfig;
 use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds};
 use crate::learners::update::ModelUpdate;
-use crate::policy::{Policy, network_choices};
 use crate::reward::met;
-use crate::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
+use emberwatch_acting::beliefs::autoencoder::AutoencoderEstimator;
+use emberwatch_acting::beliefs::numbered_states;
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::policy::{Policy, network_choices};
+use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use emberwatch_network::{FrameReplay, Track, Transition, Window};

@@ -1,18 +1,18 @@
 //! Tests of the belief that learners plan on, and of resuming from checkpoints.
 
-use crate::beliefs::learned::LearnedModel;
-use crate::beliefs::neural::NeuralModel;
-use crate::beliefs::{KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL};
 use crate::checkpoint::Contents;
-use crate::config::AgentConfig;
-use crate::learned::Learned;
 use crate::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use crate::learners::filter::FilterLearner;
 use crate::learners::filter::fit::FilterFit;
 use crate::learners::network::{NetworkLearner, Progress};
 use crate::learners::neural::NeuralLearner;
 use crate::learners::{Learner, ModelUpdate, Worlds};
-use crate::rollout::Seen;
+use emberwatch_acting::beliefs::learned::LearnedModel;
+use emberwatch_acting::beliefs::neural::NeuralModel;
+use emberwatch_acting::beliefs::{KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL};
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::rollout::Seen;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::BasisKind;

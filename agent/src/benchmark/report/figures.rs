@@ -7,9 +7,9 @@ use crate::benchmark::report::statistics::Estimate;
 use crate::benchmark::report::teams::teams;
 use crate::charts::{Bar, Ladder, Point, RGBColor};
 use anyhow::{Result, bail, ensure};
-use emberwatch_learning::beliefs::{self, LEARNED};
+use emberwatch_acting::beliefs::{self, LEARNED};
+use emberwatch_acting::policy;
 use emberwatch_learning::file::replace_file;
-use emberwatch_learning::policy;
 use std::collections::BTreeSet;
 use std::path::Path;
 

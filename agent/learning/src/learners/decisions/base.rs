@@ -1,10 +1,10 @@
 //! The source of the beliefs that decisions are based on.
 
-use crate::beliefs::first_belief::first_belief;
-use crate::beliefs::{self, BeliefKind, Conditions};
-use crate::learned::Learned;
 use crate::learners::base::Beginning;
 use anyhow::{Context, Result};
+use emberwatch_acting::beliefs::first_belief::first_belief;
+use emberwatch_acting::beliefs::{self, BeliefKind, Conditions};
+use emberwatch_acting::learned::Learned;
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Model, Shape};

@@ -1,6 +1,6 @@
 //! A robot that flies options: its agent, and its unfinished transitions.
 
-use crate::rollout::Rollout;
+use emberwatch_acting::rollout::Rollout;
 use emberwatch_belief::planning::Proposal;
 use emberwatch_model::Move;
 use emberwatch_network::{Dqn, Track, Transition};

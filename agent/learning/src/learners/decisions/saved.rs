@@ -1,13 +1,14 @@
 //! Checkpoints of decisions: the DQN, and the belief that it was trained on.
 
 use super::base::{Base, belief_of};
-use crate::beliefs::learned::{LearnedModel, SavedModel};
-use crate::beliefs::neural::{NeuralModel, SavedNeuralModel};
-use crate::beliefs::{BeliefKind, NEURAL};
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::learned::Learned;
-use crate::policy::LearnedDecisions;
+use crate::models::{SavedModel, SavedNeuralModel, filter_tensors, neural_tensors};
 use anyhow::{Context, Result, ensure};
+use emberwatch_acting::beliefs::learned::LearnedModel;
+use emberwatch_acting::beliefs::neural::NeuralModel;
+use emberwatch_acting::beliefs::{BeliefKind, NEURAL};
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::policy::LearnedDecisions;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_model::Shape;
@@ -52,7 +53,10 @@ impl SavedBelief {
         };
         let (belief, tensors) = if by.learner == "neural" {
             let model = learned.get::<NeuralModel>().context(NOTHING)?;
-            (Self::Neural(SavedNeuralModel::of(model)), model.tensors()?)
+            (
+                Self::Neural(SavedNeuralModel::of(model)),
+                neural_tensors(model)?,
+            )
         } else {
             ensure!(
                 by.learner == "filter",
@@ -62,7 +66,7 @@ impl SavedBelief {
             let model = learned.get::<LearnedModel>().context(NOTHING)?;
             (
                 Self::Filter(Box::new(SavedModel::of(model))),
-                model.tensors().into(),
+                filter_tensors(model).into(),
             )
         };
         let named = |(name, shape, numbers)| (format!("{BELIEF}{name}"), shape, numbers);
@@ -143,8 +147,8 @@ impl SavedDecisions {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::beliefs::KNOWN;
-    use crate::config::AgentConfig;
+    use emberwatch_acting::beliefs::KNOWN;
+    use emberwatch_acting::config::AgentConfig;
 
     #[test]
     fn errors_name_what_is_wrong_with_a_checkpoint() {

@@ -5,15 +5,16 @@ mod neighbours;
 pub use self::neighbours::Neighbours;
 
 use super::saved::SavedFilter;
-use crate::beliefs::learned::{LearnedModel, SavedModel, named_tensors, read_parameters};
 use crate::checkpoint::{Contents, check_counts};
-use crate::config::AgentConfig;
 use crate::gradient::Adam;
 use crate::gradient::{Optimiser, Update};
 use crate::learners::base::lacks_steps;
+use crate::models::{SavedModel, named_tensors, read_parameters};
 use crate::replay::BlockReplay;
 use crate::reward::{RewardEstimate, met};
 use anyhow::Result;
+use emberwatch_acting::beliefs::learned::LearnedModel;
+use emberwatch_acting::config::AgentConfig;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_model::{Frame, Shape};

@@ -1,6 +1,6 @@
 //! Checkpoints of learned filters.
 
-use crate::beliefs::learned::SavedModel;
+use crate::models::SavedModel;
 use crate::reward::RewardEstimate;
 use serde::{Deserialize, Serialize};
 

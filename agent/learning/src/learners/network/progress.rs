@@ -1,12 +1,12 @@
 //! What Algorithm 1 has learned, which can be saved to a checkpoint and loaded again.
 
-use crate::beliefs::WorldForm;
-use crate::beliefs::autoencoder::AutoencoderModel;
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::config::AgentConfig;
-use crate::policy::network_choices;
 use crate::reward::RewardEstimate;
 use anyhow::Result;
+use emberwatch_acting::beliefs::WorldForm;
+use emberwatch_acting::beliefs::autoencoder::AutoencoderModel;
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::policy::network_choices;
 use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::{MAX_VALUES, Shape};
 use emberwatch_network::{Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape};

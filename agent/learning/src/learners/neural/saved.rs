@@ -1,6 +1,6 @@
 //! Checkpoints of neural beliefs.
 
-use crate::beliefs::neural::SavedNeuralModel;
+use crate::models::SavedNeuralModel;
 use crate::reward::RewardEstimate;
 use serde::{Deserialize, Serialize};
 

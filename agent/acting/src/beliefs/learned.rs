@@ -4,13 +4,10 @@
 
 use super::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy};
 use super::world_form::WorldForm;
-use crate::checkpoint::{Part, check, wrong};
 use anyhow::{Context, Result};
-use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::parameters::{Parameters, Tables};
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
 use emberwatch_model::Shape;
-use emberwatch_network::NamedTensor;
-use serde::{Deserialize, Serialize};
 
 pub const LEARNED: BeliefKind = BeliefKind {
     name: "learned",
@@ -72,11 +69,6 @@ impl LearnedModel {
         let neighbours = || (self.target, self.correlations.clone());
         correcting(filter, is_spatial.then(neighbours))
     }
-
-    /// Returns the parameters as named tensors.
-    pub fn tensors(&self) -> [NamedTensor; 3] {
-        named_tensors(&self.parameters, "")
-    }
 }
 
 impl LearnedBelief for LearnedModel {
@@ -95,71 +87,4 @@ impl LearnedBelief for LearnedModel {
     fn check_world(&self, world: &WorldForm) -> Result<()> {
         world.check_observations(self.tables.dimensions.n_observations)
     }
-}
-
-/// The part of a [`LearnedModel`] that a checkpoint stores besides the tensors.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SavedModel {
-    dimensions: Dimensions,
-    target: usize,
-    correlations: Correlations,
-}
-
-impl SavedModel {
-    /// Extracts the stored part of a model.
-    pub fn of(model: &LearnedModel) -> Self {
-        Self {
-            dimensions: model.parameters.dimensions,
-            target: model.target,
-            correlations: model.correlations.clone(),
-        }
-    }
-
-    /// Loads the model, with its tensors from a part of a checkpoint.
-    pub fn read(&self, part: &Part<'_>) -> Result<LearnedModel> {
-        let parameters = read_parameters(self.dimensions, part, "")?;
-        check_target(self.target, self.dimensions.n_states)?;
-        let correlations = self.correlations.clone();
-        Ok(LearnedModel::new(parameters, self.target, correlations))
-    }
-
-    /// Returns the number of observations.
-    pub fn n_observations(&self) -> usize {
-        self.dimensions.n_observations
-    }
-}
-
-/// Checks that the target is the index of a state.
-pub fn check_target(target: usize, n_states: usize) -> Result<()> {
-    let expected = format!("less than {n_states}");
-    check(target < n_states, "target", expected, target)
-}
-
-/// Returns the tensors of parameters or moments. Their names are [`Parameters::NAMES`] with a suffix.
-pub fn named_tensors(parameters: &Parameters, suffix: &str) -> [NamedTensor; 3] {
-    let shapes = parameters.dimensions.shapes();
-    [0, 1, 2].map(|at| {
-        let name = format!("{}{suffix}", Parameters::NAMES[at]);
-        (name, shapes[at].clone(), parameters.tensors[at].clone())
-    })
-}
-
-/// Loads parameters or moments with the given dimensions. Their names are [`Parameters::NAMES`] with a suffix.
-///
-/// # Errors
-/// If a dimension is out of range, or a tensor is missing or has another form.
-pub fn read_parameters(
-    dimensions: Dimensions,
-    part: &Part<'_>,
-    suffix: &str,
-) -> Result<Parameters> {
-    let checked = dimensions.check();
-    checked.map_err(|error| wrong("dimensions", "valid dimensions of a filter", error))?;
-    let names = Parameters::NAMES.map(|name| format!("{name}{suffix}"));
-    let shapes = dimensions.shapes();
-    let tensor = |at: usize| part.tensor(&names[at], &shapes[at]);
-    Ok(Parameters {
-        dimensions,
-        tensors: [tensor(0)?, tensor(1)?, tensor(2)?],
-    })
 }

@@ -66,7 +66,7 @@ mod tests {
     use crate::beliefs::learned::LearnedModel;
     use crate::beliefs::neural::NeuralModel;
     use crate::learned::Learned;
-    use crate::learners::tests::learned_filter;
+    use crate::testing::learned_filter;
     use emberwatch_belief::Belief;
     use emberwatch_model::{Frame, Model, Shape};
     use emberwatch_network::{Device, NeuralBelief};

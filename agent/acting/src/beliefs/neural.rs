@@ -9,25 +9,20 @@
 mod sensor;
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
-use super::learned::{LEARNED, LearnedModel, SavedModel, check_target};
+use super::learned::{LEARNED, LearnedModel};
 use super::world_form::WorldForm;
-use crate::checkpoint::{Part, check};
 use crate::parallel::in_parallel;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::{check as check_evidence, correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
 use emberwatch_model::grid::Probabilities;
-use emberwatch_model::{Frame, MAX_VALUES, Shape};
-use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief, Sightings};
+use emberwatch_model::{Frame, Shape};
+use emberwatch_network::{NetworkError, NeuralBelief, Sightings};
 use ndarray::Array2;
 use sensor::{inverse, states_from_observations};
-use serde::{Deserialize, Serialize};
 use std::any::Any;
 use std::borrow::Cow;
-
-/// Prefix of the names of the corrected filter's tensors.
-const FILTER: &str = "filter.";
 
 pub const NEURAL: BeliefKind = BeliefKind {
     name: "neural",
@@ -91,13 +86,6 @@ impl NeuralModel {
     pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator> {
         estimator(&self.network, self.filter.as_deref(), shape)
     }
-
-    /// Returns the parameters as named tensors.
-    pub fn tensors(&self) -> Result<Vec<NamedTensor>> {
-        let filter = self.filter.iter().flat_map(|it| corrected_tensors(it));
-        let parameters = self.network.parameters()?.into_iter();
-        Ok(parameters.chain(filter).collect())
-    }
 }
 
 impl LearnedBelief for NeuralModel {
@@ -130,64 +118,6 @@ pub fn estimator(
 ) -> Result<NeuralEstimator> {
     let filter = filter.map(|it| it.estimator(true, shape));
     Ok(NeuralEstimator::new(network, filter, shape)?)
-}
-
-/// Returns the tensors of a corrected filter, with the prefix `filter.`.
-pub fn corrected_tensors(filter: &LearnedModel) -> impl Iterator<Item = NamedTensor> + use<> {
-    let named = |(name, shape, numbers)| (format!("{FILTER}{name}"), shape, numbers);
-    filter.tensors().into_iter().map(named)
-}
-
-/// The part of a [`NeuralModel`] that a checkpoint stores besides the tensors.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SavedNeuralModel {
-    n_observations: usize,
-    target: usize,
-    /// The filter whose prediction the network corrects.
-    filter: Option<Box<SavedModel>>,
-}
-
-impl SavedNeuralModel {
-    /// Extracts the stored part of a model.
-    pub fn of(model: &NeuralModel) -> Self {
-        let filter = model.filter.as_deref();
-        Self {
-            n_observations: model.network.n_observations(),
-            target: model.target,
-            filter: filter.map(|it| Box::new(SavedModel::of(it))),
-        }
-    }
-
-    /// Returns the number of observations.
-    pub fn n_observations(&self) -> usize {
-        self.n_observations
-    }
-
-    /// Loads the model, with its tensors from a part of a checkpoint. The network computes on `device`.
-    pub fn read(&self, part: &Part<'_>, device: &Device) -> Result<NeuralModel> {
-        let n_observations = self.n_observations;
-        let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
-        let fits = fits.contains(&n_observations);
-        check(fits, "n_observations", expected, n_observations)?;
-        check_target(self.target, n_observations)?;
-        let mut network = NeuralBelief::new(n_observations, 0, device)?;
-        network.set_parameters(|name: &str, shape: &[usize]| part.tensor(name, shape))?;
-        Ok(NeuralModel {
-            network,
-            filter: self.read_filter(part)?,
-            target: self.target,
-        })
-    }
-
-    /// Loads the corrected filter, if there is one.
-    pub fn read_filter(&self, part: &Part<'_>) -> Result<Option<Box<LearnedModel>>> {
-        let Some(filter) = &self.filter else {
-            return Ok(None);
-        };
-        let (expected, got) = (self.n_observations, filter.n_observations());
-        check(got == expected, "filter.n_observations", expected, got)?;
-        Ok(Some(Box::new(filter.read(&part.part(FILTER))?)))
-    }
 }
 
 /// The neural belief of one world.

@@ -1,13 +1,13 @@
 //! Steps of agents that plan for one or more robots.
 
+use emberwatch_acting::beliefs::Conditions;
+use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::Learned;
+use emberwatch_acting::policy::Policy;
+use emberwatch_acting::rollout::agent::Agent;
+use emberwatch_acting::rollout::building::agent;
+use emberwatch_acting::rollout::{Actor, Rollout, Seen};
 use emberwatch_belief::Belief;
-use emberwatch_learning::beliefs::Conditions;
-use emberwatch_learning::config::AgentConfig;
-use emberwatch_learning::learned::Learned;
-use emberwatch_learning::policy::Policy;
-use emberwatch_learning::rollout::agent::Agent;
-use emberwatch_learning::rollout::building::agent;
-use emberwatch_learning::rollout::{Actor, Rollout, Seen};
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::randomness::split_mix;

@@ -1,5 +1,5 @@
 use super::*;
-use crate::learners::tests::learned_filter;
+use crate::testing::learned_filter;
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_network::{Device, Lesson};
 

@@ -4,23 +4,19 @@ use super::*;
 use crate::beliefs::autoencoder::AutoencoderEstimator;
 use crate::beliefs::neural::NeuralModel;
 use crate::beliefs::{KNOWN, numbered_states};
-use crate::learners::decisions::SHAPE;
-use crate::learners::network::Progress;
-use crate::learners::tests::{config, learned_filter, worlds};
 use crate::policy::LearnedDecisions;
+use crate::testing::{config, learned_filter, network, shape};
 use anyhow::Result;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Estimator;
+use emberwatch_belief::planning::OPTIONS;
+use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Frame, Grid, Model, Shape};
-use emberwatch_network::{Device, Dqn, DqnSettings, DqnShape, NeuralBelief};
+use emberwatch_model::{Cell, Frame, Grid, Model};
+use emberwatch_network::{Device, Dqn, DqnShape, NeuralBelief};
 use std::sync::Arc;
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
-
-fn shape() -> Shape {
-    worlds().shape()
-}
 
 /// Returns hidden states, and a frame that shows the states of some cells.
 fn world(step: u64) -> (Grid<u8>, Frame) {
@@ -36,17 +32,6 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
     (states, frame)
 }
 
-/// An untrained network. The seed of its DQN is the lowest seed with which the DQN satisfies the condition `suits`.
-fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
-    let mut config = config(basis);
-    config.seed = 1;
-    let mut network = Progress::first(&worlds().form(), &config, &Device::Cpu).expect("a network");
-    let actions = DqnShape::of_actions(network.autoencoder.shape().hidden, 4);
-    let dqn = |seed| Dqn::new(DqnSettings::paper(), actions, seed);
-    network.dqn = (0..1000).map(dqn).find(suits).expect("a seed that suits");
-    network.into_model()
-}
-
 fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent> {
     let model = Model::wildfire();
     let conditions = Conditions {
@@ -56,7 +41,7 @@ fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent>
         learned,
     };
     let policy = Policy::named(policy, &model).expect("known");
-    super::agent(&policy, config, &conditions, worlds().n_moves, 7)
+    super::agent(&policy, config, &conditions, 6, 7)
 }
 
 /// Returns whether an agent's plans equal the plans on the estimate, and whether they equal the plans on the predictor.
@@ -106,9 +91,10 @@ fn every_policy_plans_on_the_configured_belief() {
 /// A DQN that chooses options on the belief of a known model.
 fn decisions(basis: BasisKind) -> LearnedDecisions {
     let settings = config(basis).decisions.settings();
+    let shape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
     LearnedDecisions {
         beam_width: 30,
-        scorer: Arc::new(Dqn::new(settings, SHAPE, 0)),
+        scorer: Arc::new(Dqn::new(settings, shape, 0)),
         belief: &KNOWN,
         basis,
     }
