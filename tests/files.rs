@@ -1,6 +1,7 @@
 //! Tests of settings and model files. Errors name the path and the invalid entry; valid files are accepted.
 
-use crate::commands::check;
+use crate::commands::{agent, check};
+use crate::trainings::COMPARED;
 use tests::harness::{Folder, SERVER, SMALL, Server, repository, run};
 
 #[test]
@@ -69,4 +70,7 @@ fn worlds_in_which_nothing_pays_or_burns_are_warned_of_once() {
         let log = Server::start(&flags).program.stderr();
         assert_eq!(log.matches(words).count(), n_warnings, "{log}");
     }
+    let inside =
+        format!("compare {COMPARED} --policies coverage --baseline coverage --model {free}");
+    agent(&inside).check_says("no state pays");
 }

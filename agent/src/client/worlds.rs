@@ -45,11 +45,13 @@ impl Worlds {
         })
     }
 
-    /// Simulates worlds in this process, and starts their burn-ins.
+    /// Simulates worlds in this process, and starts their burn-ins. Logs warnings about the settings.
     ///
     /// # Errors
     /// If there is too little memory, or no threads can be started.
     pub fn simulate(settings: Checked) -> Result<Self> {
+        let warnings = settings.warnings();
+        warnings.iter().for_each(|words| tracing::warn!("{words}"));
         Ok(Self::Simulated(Box::new(Embedded::new(settings)?)))
     }
 

@@ -150,17 +150,22 @@ impl SuiteCommand {
     fn carry_out(&self, plan: &Plan) -> Result<Vec<PolicyRun>> {
         let task = &plan.task().name;
         let mut runs = plan.comparable();
+        let mut ready = Vec::new();
+        for policy in &plan.comparison.policies {
+            match self.prepare(plan, policy) {
+                Ok(trained) => ready.push((policy, trained)),
+                Err(reason) => {
+                    tracing::warn!("task {task}: {} is not run: {reason:#}", policy.name);
+                }
+            }
+        }
+        if ready.is_empty() {
+            return Ok(runs);
+        }
+        // Opened after all trainings, because an unused lease ends.
         let n_worlds = plan.worlds.len() as u32;
         let mut arena = open(plan.settings.clone(), &plan.comparison.seeds, n_worlds)?;
-        for policy in &plan.comparison.policies {
-            let name = &policy.name;
-            let trained = match self.prepare(plan, policy) {
-                Ok(trained) => trained,
-                Err(reason) => {
-                    tracing::warn!("task {task}: {name} is not run: {reason:#}");
-                    continue;
-                }
-            };
+        for (policy, trained) in ready {
             let comparison = Comparison {
                 policies: vec![policy.clone()],
                 learned: trained.learned,
@@ -171,7 +176,7 @@ impl SuiteCommand {
                 run.task.clone_from(task);
                 run.training_seconds = trained.seconds;
             }
-            write_runs(&plan.folder.join(file_of(name)), &new)?;
+            write_runs(&plan.folder.join(file_of(&policy.name)), &new)?;
             runs.extend(new);
         }
         Ok(runs)

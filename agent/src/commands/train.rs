@@ -268,6 +268,11 @@ impl TrainCommand {
 
     /// Attaches to the server, or starts to simulate worlds.
     fn worlds(&self, training: &TrainingSpec) -> Result<Worlds> {
+        let n_numbers = self.simulation.robots.len();
+        ensure!(
+            n_numbers <= 1,
+            "--robots: expected one number of robots per world, got {n_numbers}"
+        );
         let episode_steps = (training.learner()?.episode_steps)(&training.config);
         if let Some(name) = &self.instance {
             let worlds = Worlds::attach(&Instance::new(name)?, false)?;

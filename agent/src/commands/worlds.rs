@@ -115,7 +115,8 @@ impl SimulationFlags {
     /// Separates the model of beliefs about recorded states from the settings of the worlds.
     fn separate(&self) -> Result<(Self, Option<Model>)> {
         let mut flags = self.clone();
-        if !flags.worlds.contains_key("states") {
+        let states = flags.worlds.get("states").and_then(Value::as_str);
+        if states.is_none_or(str::is_empty) {
             return Ok((flags, None));
         }
         let name = flags.worlds.remove("model");

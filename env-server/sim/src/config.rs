@@ -13,7 +13,7 @@ use emberwatch_model::settings;
 use emberwatch_model::settings::{ANY, SettingError, Settings, Start, WorldSettings};
 use emberwatch_model::task::{Task, TaskError};
 use emberwatch_model::text::{parse_problem, read_text, shortened};
-use emberwatch_model::{Model, Shape};
+use emberwatch_model::{Model, Ratio, Shape, TRANSITIONS_FORM};
 use serde_json::{Map, Value};
 use std::fmt::Display;
 use std::path::Path;
@@ -116,6 +116,30 @@ pub enum ConfigError {
 }
 
 impl Checked {
+    /// Describes valid settings that are probably not meant: starts that no-fly cells enclose, states without rewards,
+    /// and a kernel with which filters predict badly.
+    pub fn warnings(&self) -> Vec<String> {
+        let starts = self.reach.closed_in.iter();
+        let mut warnings: Vec<String> = starts.map(ToString::to_string).collect();
+        if self.model.reward().iter().all(|&reward| reward == 0.0) {
+            warnings.push(format!(
+                "{}: no state pays: every reward will be 0; give a state a `reward` in the model file",
+                self.model.name()
+            ));
+        }
+        if let Some(uneven) = self.model.ratio().and_then(Ratio::uneven_place) {
+            let names = self.model.state_names();
+            let ([row, col], [least, most]) = (uneven.place, uneven.states.map(|it| &names[it]));
+            warnings.push(format!(
+                "kernel: expected weights of all states within a factor of 2, got a sum of {} for {least:?} and {} for \
+                 {most:?} in row {row}, column {col}, so filters predict badly: write transitions instead, by which each \
+                 neighbour tries independently:\n{TRANSITIONS_FORM}",
+                uneven.weights[0], uneven.weights[1],
+            ));
+        }
+        warnings
+    }
+
     /// Returns the same settings with another number of worlds.
     ///
     /// # Errors
