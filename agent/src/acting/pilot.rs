@@ -59,7 +59,6 @@ impl Pilot {
     /// Acquires the robots in the present state of their world, and updates the belief with the world's latest frame.
     pub fn attach(mission: &Mission) -> Result<Self> {
         let info = info_of(&mission.instance, &mission.worlds())?;
-        mission.check_task(&info)?;
         let numbers = mission.numbers(&info)?;
         let recorded = recorded_states(&info)?.filter(|_| mission.model.is_none());
         let is_recorded = recorded.is_some();

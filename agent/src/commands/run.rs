@@ -15,8 +15,7 @@ use emberwatch_protocol::Model;
 use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::stop_on_signals;
-use emberwatch_protocol::task::Task;
-use emberwatch_sim::config::{ServerConfig, model_named};
+use emberwatch_sim::config::model_named;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
@@ -56,9 +55,6 @@ pub struct RunCommand {
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
     wait: Duration,
     #[arg(long, value_name = "NAME|FILE", help = format!(
-        "Refuse the server unless it has this task: {}, or a task file", listed(Task::built_in_names())))]
-    task: Option<String>,
-    #[arg(long, value_name = "NAME|FILE", help = format!(
         "Model, if the server does not reveal it: {}, or a model file", listed(Model::built_in_names())))]
     model: Option<String>,
     /// Device for networks: cpu, cuda or metal
@@ -82,7 +78,6 @@ impl RunCommand {
         );
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
-            task: self.task.as_deref().map(task_with_model).transpose()?,
             world: self.world,
             robots: self.robots.clone(),
             team: self.team,
@@ -105,18 +100,6 @@ impl RunCommand {
         tracing::info!(steps = summary.steps, mean_reward, "done");
         Ok(())
     }
-}
-
-/// Returns the task, with its model unless the task is recorded.
-fn task_with_model(task: &str) -> Result<(Task, Option<Model>)> {
-    let settings = ServerConfig {
-        task: task.into(),
-        ..ServerConfig::default()
-    };
-    let settings = settings.check()?;
-    let model = settings.recorded.is_none().then_some(settings.model);
-    let task = settings.task.context("invariant: a task was given")?;
-    Ok((task, model))
 }
 
 /// Parses the number of a robot, or a range.

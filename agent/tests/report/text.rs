@@ -55,14 +55,6 @@ fn a_table_gives_errors_over_worlds_and_paired_differences() {
     ] {
         assert_eq!(row(&table, policy, 0)[1..].join(" "), expected);
     }
-    // Worlds are split at the median of their burning cells.
-    assert!(table.contains("median of 200.0 burning cells"), "{table}");
-    assert!(
-        table.contains("less fire (1 world) | more fire (2 worlds)"),
-        "{table}"
-    );
-    let halves = ["beam", "known", "2.00 (n = 1)", "6.50 ± 1.50"];
-    assert_eq!(row(&table, "beam", 1), halves);
 }
 
 #[test]
@@ -136,7 +128,6 @@ fn tables_leave_out_what_there_is_not() {
     for words in [
         "no standard error is possible",
         "baseline \"nobody\" was not run",
-        "No split by fire",
     ] {
         assert!(table.contains(words), "{table}");
     }
