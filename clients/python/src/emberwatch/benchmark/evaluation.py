@@ -25,6 +25,7 @@ from emberwatch.client.client import Client
 from emberwatch.common.arguments import as_count, as_list, as_seed
 from emberwatch.common.paths import with_absolute_paths
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
+from emberwatch.envs.path_env import WildfireVectorEnv
 from emberwatch.envs.settings import Settings, WorldArguments
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model.tasks import Task
@@ -154,8 +155,8 @@ def _with_defaults(
         keywords.setdefault("truth", info.publish_truth)
         return keywords, info.n_robots, info.worlds_fingerprint or ""
     keywords.setdefault("truth", True)  # worlds in this process can always reveal it
-    world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
-    fingerprint = Settings(**world).read().worlds_fingerprint
+    world: Any = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
+    fingerprint = Settings.of(WildfireVectorEnv, world).read().worlds_fingerprint
     return keywords, keywords.get("robots") or (task.robots if task else 1), fingerprint
 
 
