@@ -536,9 +536,7 @@ def beam_search(
 class MeritTally:
     """Running figures of merit of several worlds."""
 
-    def __new__(
-        cls, n_worlds: int, height: int, width: int, target: int, recent_steps: int
-    ) -> MeritTally: ...
+    def __new__(cls, n_worlds: int, height: int, width: int, target: int) -> MeritTally: ...
     def update(
         self,
         visited: NDArray[np.bool_],

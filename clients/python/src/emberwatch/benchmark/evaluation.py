@@ -15,7 +15,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emberwatch.belief.merit import RECENT_STEPS
 from emberwatch.benchmark.policies import Actor, Policy
 from emberwatch.benchmark.report import Progress
 from emberwatch.benchmark.rows import Row, RowFile
@@ -120,7 +119,6 @@ def evaluate(
         "robots": n_robots,
         "team": "shared" if n_robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,
-        "recent_steps": RECENT_STEPS,
         "worlds_fingerprint": fingerprint,
     }
     played = {(fingerprint, seed, steps) for seed in chosen}
