@@ -5,7 +5,7 @@
 use emberwatch_model::path::Flight;
 use emberwatch_model::{Cell, Grid, Shape};
 
-/// Default number of steps for which a cell counts as seen after a visit.
+/// Number of steps for which a cell counts as seen after a visit.
 pub const RECENT_STEPS: u32 = 10;
 
 /// The figures of one run. A figure is `None` if there was nothing to measure.
@@ -15,11 +15,11 @@ pub struct Merit {
     pub steps_to_detection: Option<u64>,
     /// Number of burning cells in the world at the step of that visit.
     pub burning_cells_at_detection: Option<u32>,
-    /// Fraction of the burning cells that a robot visited in the last [`MeritTally::recent_steps()`] steps, averaged
-    /// over steps with fire.
+    /// Fraction of the burning cells that a robot visited in the last [`RECENT_STEPS`] steps, averaged over steps with
+    /// fire.
     pub burning_seen_share: Option<f64>,
-    /// Number of moves from the nearest robot to the nearest burning cell that no robot visited recently, averaged over
-    /// the steps in which there is such a cell.
+    /// Number of moves from the nearest robot to the nearest burning cell that no robot visited in these steps,
+    /// averaged over the steps in which there is such a cell.
     pub front_distance: Option<f64>,
     /// Fraction of all cells that any robot visited during the run.
     pub grid_seen_share: f64,
@@ -39,7 +39,6 @@ pub struct Found {
 pub struct MeritTally {
     shape: Shape,
     target: u8,
-    recent_steps: u32,
     step: u32,
     /// The step of the last visit to each cell, row-major. 0 if the cell was never visited.
     last_visits: Vec<u32>,
@@ -57,12 +56,11 @@ struct Mean {
 }
 
 impl MeritTally {
-    /// Creates the tally before the first step. `target` is the burning state, and `recent_steps` must be at least 1.
-    pub fn new(shape: Shape, target: u8, recent_steps: u32) -> Self {
+    /// Creates the tally before the first step. `target` is the burning state.
+    pub fn new(shape: Shape, target: u8) -> Self {
         Self {
             shape,
             target,
-            recent_steps,
             step: 0,
             last_visits: vec![0; shape.n_cells()],
             n_seen: 0,
@@ -88,10 +86,6 @@ impl MeritTally {
         }
     }
 
-    pub fn recent_steps(&self) -> u32 {
-        self.recent_steps
-    }
-
     /// Returns the figures so far.
     pub fn merit(&self) -> Merit {
         Merit {
@@ -106,7 +100,7 @@ impl MeritTally {
     /// Updates the figures that need the hidden states.
     fn watch(&mut self, flights: &[Flight], states: &Grid<u8>) {
         let states = states.as_slice().expect("invariant: grids are row-major");
-        let forgotten = self.step.saturating_sub(self.recent_steps);
+        let forgotten = self.step.saturating_sub(RECENT_STEPS);
         // Avoid branches, so that the compiler vectorises the loop.
         let (mut n_burning, mut n_seen) = (0_u32, 0_u32);
         for (&state, &visit) in states.iter().zip(&self.last_visits) {
@@ -185,9 +179,9 @@ mod tests {
     }
 
     /// Computes the figures of a run. Each step consists of the world and the cells that each robot visits.
-    fn merit(recent_steps: u32, steps: &[(&str, &[&[usize]])]) -> Merit {
+    fn merit(steps: &[(&str, &[&[usize]])]) -> Merit {
         let shape = Shape::new(1, steps[0].0.len()).expect("test shape");
-        let mut tally = MeritTally::new(shape, FIRE, recent_steps);
+        let mut tally = MeritTally::new(shape, FIRE);
         for (row, robots) in steps {
             let flights: Vec<Flight> = robots.iter().map(|visited| flight(visited)).collect();
             let states = world(row);
@@ -210,11 +204,11 @@ mod tests {
         // Cell 1 is visited before it burns, then missed. Cell 2 is found when two cells burn.
         let steps: [(&str, &[&[usize]]); 3] =
             [("....", &[&[0, 1]]), (".#..", &[&[2]]), (".##.", &[&[2]])];
-        assert_eq!(of(merit(9, &steps)), (Some(3), Some(2)));
+        assert_eq!(of(merit(&steps)), (Some(3), Some(2)));
         // Later detections do not count.
-        let got = merit(9, &[("#...", &[&[0]]), ("####", &[&[1]])]);
+        let got = merit(&[("#...", &[&[0]]), ("####", &[&[1]])]);
         assert_eq!(of(got), (Some(1), Some(1)));
-        let got = merit(9, &[("...#", &[&[0]]), ("...#", &[&[1]])]);
+        let got = merit(&[("...#", &[&[0]]), ("...#", &[&[1]])]);
         assert_eq!((of(got), got.burning_seen_share), ((None, None), Some(0.0)));
         // The distance is 3 moves in one step and 2 in the other.
         assert_eq!(got.front_distance, Some(2.5));
@@ -222,7 +216,7 @@ mod tests {
 
     #[test]
     fn a_world_without_fire_has_no_share_and_no_front() {
-        let got = merit(9, &[("....", &[&[0]]), ("....", &[&[1, 2]])]);
+        let got = merit(&[("....", &[&[0]]), ("....", &[&[1, 2]])]);
         let expected = Merit {
             steps_to_detection: None,
             burning_cells_at_detection: None,
@@ -232,31 +226,29 @@ mod tests {
         };
         assert_eq!(got, expected);
         // Steps without fire do not count. In the other step, half of the fire is seen.
-        let got = merit(9, &[("....", &[&[0]]), ("#..#", &[&[1]])]);
+        let got = merit(&[("....", &[&[0]]), ("#..#", &[&[1]])]);
         assert_eq!(got.burning_seen_share, Some(0.5));
         // If all fire is seen, there is no front.
-        let got = merit(9, &[("##..", &[&[1, 0]]), ("##..", &[&[2, 3]])]);
+        let got = merit(&[("##..", &[&[1, 0]]), ("##..", &[&[2, 3]])]);
         assert_eq!(got.burning_seen_share, Some(1.0));
         assert_eq!((got.front_distance, got.grid_seen_share), (None, 1.0));
     }
 
     #[test]
     fn only_recent_visits_count_as_seen() {
-        let steps: [(&str, &[&[usize]]); 3] =
-            [("#..#", &[&[0]]), ("#..#", &[&[1]]), ("#..#", &[&[2]])];
-        // One of two burning cells counts as seen in all 3 steps, in the first two, or only in the first. The nearest
-        // unseen fire is 3, 2 and 1 moves away, or 3, 1 and 1 moves if cell 0 is forgotten after one step.
-        for (recent_steps, seen, moves) in [(3, 1.5, 6.0), (2, 1.0, 6.0), (1, 0.5, 5.0)] {
-            let got = merit(recent_steps, &steps);
-            assert_eq!(got.burning_seen_share, Some(seen / 3.0), "{recent_steps}");
-            assert_eq!(got.front_distance, Some(moves / 3.0), "{recent_steps}");
-            assert_eq!(got.grid_seen_share, 0.75, "{recent_steps}");
-        }
+        // Cell 0 counts as seen in steps 1 to 10, with the nearest unseen fire 3 moves away in the first, then 2. In the
+        // steps after these, cell 0 is unseen fire, 1 move away.
+        let mut steps: Vec<(&str, &[&[usize]])> = vec![("#..#", &[&[1]]); 12];
+        steps[0].1 = &[&[0]];
+        let got = merit(&steps);
+        assert_eq!(got.burning_seen_share, Some(0.5 * 10.0 / 12.0));
+        assert_eq!(got.front_distance, Some((3.0 + 9.0 * 2.0 + 2.0) / 12.0));
+        assert_eq!(got.grid_seen_share, 0.5);
     }
 
     #[test]
     fn visits_of_all_robots_count_together() {
-        let got = merit(9, &[("#....#.#", &[&[0, 1], &[4, 5]])]);
+        let got = merit(&[("#....#.#", &[&[0, 1], &[4, 5]])]);
         let expected = Merit {
             steps_to_detection: Some(1),
             burning_cells_at_detection: Some(3),

@@ -7,7 +7,7 @@ use emberwatch_acting::policy::Policy;
 use emberwatch_acting::rollout::Rollout;
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::scoring::Score;
-use emberwatch_belief::merit::{Found, MeritTally, RECENT_STEPS};
+use emberwatch_belief::merit::{Found, MeritTally};
 use emberwatch_belief::planning::Plan;
 use emberwatch_protocol::Shape;
 use emberwatch_protocol::control::ServerInfo;
@@ -52,7 +52,7 @@ impl WorldRun {
             brier: None,
             score: Score::default(),
             flights: Vec::new(),
-            merit: MeritTally::new(shape, target as u8, RECENT_STEPS),
+            merit: MeritTally::new(shape, target as u8),
         }
     }
 
@@ -119,7 +119,6 @@ impl WorldRun {
             mean_repeated: share(self.n_visited_each - self.n_visited, self.n_visited_each),
             steps_to_detection: merit.steps_to_detection,
             burning_cells_at_detection: merit.burning_cells_at_detection,
-            recent_steps: Some(self.merit.recent_steps()),
             burning_seen_share: merit.burning_seen_share,
             front_distance: merit.front_distance,
             grid_seen_share: Some(merit.grid_seen_share),

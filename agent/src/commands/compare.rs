@@ -14,7 +14,6 @@ use crate::benchmark::report::{
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-use emberwatch_belief::merit::RECENT_STEPS;
 
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
@@ -182,13 +181,6 @@ impl CompareCommand {
             );
             check_worlds(policy, group.runs.iter().copied(), &comparison.worlds(info))
                 .context("--add")?;
-            ensure!(
-                group
-                    .runs
-                    .iter()
-                    .all(|run| run.recent_steps == Some(RECENT_STEPS)),
-                "--add: policy {policy:?}: expected rows with recent_steps {RECENT_STEPS}"
-            );
         }
         Ok(())
     }

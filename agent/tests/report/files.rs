@@ -1,4 +1,4 @@
-//! Tests of the CSV file of runs: links, byte order marks, missing columns.
+//! Tests of the CSV file of runs: links, byte order marks, missing and unknown columns.
 
 use super::synthetic::run;
 use emberwatch_agent::benchmark::report::runs_file::{check_runs_file, read_runs, write_runs};
@@ -18,13 +18,13 @@ fn the_file_behind_a_link_is_replaced() {
 }
 
 #[test]
-fn a_byte_order_mark_and_missing_columns_do_no_harm() {
+fn a_byte_order_mark_and_other_columns_do_no_harm() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("runs.csv");
     write_runs(&path, &[run("mine", "none", 0, 1.0)]).expect("written");
     let text = std::fs::read_to_string(&path).expect("rows");
-    // Rows of other programs lack the last column, `training_seconds`.
-    let cut = |line: &str| line.rsplitn(2, ',').last().map(String::from);
+    // Rows of other programs lack the last column, `training_seconds`, and have columns of their own.
+    let cut = |line: &str| line.rsplit_once(',').map(|(line, _)| format!("{line},10"));
     let lines: Vec<String> = text.lines().filter_map(cut).collect();
     std::fs::write(&path, format!("\u{feff}{}", lines.join("\r\n"))).expect("written");
     let runs = read_runs(&path).expect("rows");

@@ -88,7 +88,7 @@ fn with_merit() -> Vec<PolicyRun> {
         run.burning_seen_share = Some(0.3);
     }
     for run in &mut runs[..6] {
-        (run.recent_steps, run.grid_seen_share) = (Some(25), Some(0.5));
+        run.grid_seen_share = Some(0.5);
     }
     runs
 }
@@ -97,7 +97,7 @@ fn with_merit() -> Vec<PolicyRun> {
 fn figures_of_merit_say_in_how_many_worlds_fire_was_detected() {
     let mut runs = with_merit();
     let table = render_table(&runs, "coverage");
-    assert!(table.contains("in the last 25 steps"), "{table}");
+    assert!(table.contains("in the last 10 steps"), "{table}");
     // Standard errors: sqrt(2 / 2 / 3) = 0.6 for detection after 1, 2, 3 steps, and sqrt(800 / 2 / 3) = 11.5 for seen
     // shares of 50, 70, 90 % and their differences. A world without a detection has no detection time, and a world
     // without unseen fire has no distance. The oracle's rows are from an old file.
@@ -148,7 +148,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
     assert!(text.starts_with(
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
          mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
-         steps_to_detection,burning_cells_at_detection,recent_steps,burning_seen_share,front_distance,\
+         steps_to_detection,burning_cells_at_detection,burning_seen_share,front_distance,\
          grid_seen_share,log_likelihood,worlds_fingerprint,training_seconds\n"
     ));
     // Rows are sorted by policy and world.

@@ -158,13 +158,11 @@ impl CheckedSettings {
     }
 }
 
-/// Returns the defaults of the settings of worlds as JSON, by name.
+/// Returns the range of each setting of worlds, by name; `None` unless the setting is a number.
 #[pyfunction]
-pub fn world_settings() -> BTreeMap<&'static str, String> {
+pub fn world_settings() -> BTreeMap<&'static str, Option<(i128, i128)>> {
     let settings = WorldSettings::settings().into_iter();
-    settings
-        .map(|it| (it.name, (it.default)().to_string()))
-        .collect()
+    settings.map(|it| (it.name, it.range)).collect()
 }
 
 /// Reads settings again for a copy in another process. Refuses files that have changed since `fingerprint` was made.

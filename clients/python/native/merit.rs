@@ -30,7 +30,6 @@ impl MeritTally {
         height: usize,
         width: usize,
         target: u8,
-        recent_steps: u32,
     ) -> PyResult<Self> {
         let shape = shape_of(py, height, width)?;
         let n_bytes = n_worlds.saturating_mul(size_of::<u32>() * shape.n_cells());
@@ -39,7 +38,7 @@ impl MeritTally {
             format_args!("the figures of merit of {n_worlds} worlds"),
             n_bytes,
         )?;
-        let tally = merit::MeritTally::new(shape, target, recent_steps);
+        let tally = merit::MeritTally::new(shape, target);
         Ok(Self {
             shape,
             worlds: vec![tally; n_worlds],

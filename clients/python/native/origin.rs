@@ -91,11 +91,16 @@ impl Origin {
         worlds.map_err(|error| unfit(py, &error))
     }
 
-    /// Returns whether a step is too short to divide among threads, as with the plain filter or a single world. Never
-    /// true for parallel kinds: all their work must run on a [`Pool`], as they would use rayon's global pool elsewhere.
+    /// Returns whether a step is too short to divide among threads, as with the plain filter or a single world.
     pub fn is_short(&self, n_worlds: usize) -> bool {
-        *self.kind == KNOWN || (n_worlds <= 1 && !self.kind.is_parallel)
+        *self.kind == KNOWN || is_short(self.kind, n_worlds)
     }
+}
+
+/// Returns whether the work on some worlds is too short to divide among threads, as with a single world. Never true for
+/// parallel kinds: all their work must run on a [`Pool`], as they would use rayon's global pool elsewhere.
+pub fn is_short(kind: &BeliefKind, n_worlds: usize) -> bool {
+    n_worlds <= 1 && !kind.is_parallel
 }
 
 /// Returns the bytes of a checkpoint, to be read only once.

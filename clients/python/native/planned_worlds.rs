@@ -1,6 +1,7 @@
 //! Single-robot worlds with their beliefs and plans: belief updates, planning, and publishing to observers.
 
 use crate::answer::RESULT_BYTES;
+use crate::origin::is_short;
 use crate::threads::{Pool, Threads};
 use crate::wire::{Feed, View};
 use anyhow::{Context, Result, ensure};
@@ -101,7 +102,7 @@ impl PlannedWorlds {
         let Self { crew, threads, .. } = self;
         let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?));
         let n_worlds = seeds.len();
-        let begun = threads.work(is_short(crew, n_worlds), |threads| {
+        let begun = threads.work(is_short(crew.estimator(), n_worlds), |threads| {
             threads.each(seeds, begin)
         });
         // Either all episodes begin, or none.
@@ -139,7 +140,7 @@ impl PlannedWorlds {
             })
         });
         let tasks: Vec<WorldWork<'_>> = tasks.collect();
-        let done = threads.work(is_short(crew, tasks.len()), |threads| {
+        let done = threads.work(is_short(crew.estimator(), tasks.len()), |threads| {
             work_on(crew, tasks, threads)
         });
         let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
@@ -151,8 +152,10 @@ impl PlannedWorlds {
     fn rows(&self, worlds: &[usize]) -> Result<Vec<Option<usize>>> {
         let mut rows = vec![None; self.worlds.len()];
         for (row, &world) in worlds.iter().enumerate() {
-            let place = rows.get_mut(world);
-            *place.with_context(|| no_such_world(self.worlds.len(), world))? = Some(row);
+            let (place, n_worlds) = (rows.get_mut(world), self.worlds.len());
+            *place.with_context(|| {
+                format!("options: expected a world below {n_worlds}, got {world}")
+            })? = Some(row);
         }
         Ok(rows)
     }
@@ -286,14 +289,4 @@ impl WorldWork<'_> {
             intent,
         }))
     }
-}
-
-/// Returns whether the work is too short to divide among threads, as with a single world. Never true for kinds of
-/// belief that are parallel.
-fn is_short(crew: &Crew, n_worlds: usize) -> bool {
-    n_worlds <= 1 && !crew.estimator().is_parallel
-}
-
-fn no_such_world(n_worlds: usize, got: usize) -> String {
-    format!("options: expected a world below {n_worlds}, got {got}")
 }

@@ -134,6 +134,7 @@ def test_a_radius_can_be_combined_with_a_model() -> None:
     wide = make(sensor_radius=8)
     assert wide.unwrapped.model.sensor_radius == 8
     assert (rollout(wide, 1, seed=1)[1][0]["frame"] != 255).sum() > 30
+    assert make(sensor_radius=-1).unwrapped.model == make().unwrapped.model
     with serving(sensor_radius=2) as instance:
         for radius in (None, 2):
             env = make(instance=instance, sensor_radius=radius)

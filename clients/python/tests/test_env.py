@@ -2,13 +2,15 @@
 
 import dataclasses
 import gc
+import json
 import os
 import pydoc
 import re
 import subprocess
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args, get_type_hints
 
 import gymnasium
 import numpy as np
@@ -34,8 +36,9 @@ from gymnasium.vector import AsyncVectorEnv
 from processes import find
 
 import emberwatch
+import emberwatch._native as _native
 from emberwatch.envs.parallel import WildfireParallelEnv
-from emberwatch.envs.settings import Settings
+from emberwatch.envs.settings import Settings, WorldArguments
 from emberwatch.errors import LeaseLostError, NoServerError
 
 PARTS = ["frame", "robot", "age"]
@@ -86,10 +89,29 @@ def test_help_shows_each_keyword_with_its_default() -> None:
     names = (f"Wildfire{what}{of}" for what in ("", "Moves", "Objective") for of in SHAPES)
     for kind in (*(getattr(emberwatch, name) for name in names), WildfireParallelEnv):
         words = pydoc.render_doc(kind, renderer=pydoc.plaintext)
-        for field in dataclasses.fields(Settings):
-            shown = re.search(rf"\b{field.name}: [^=]+ = {re.escape(repr(field.default))}", words)
-            assert bool(shown) == (field.name != "reveals"), field.name
+        own = {field.name: repr(field.default) for field in dataclasses.fields(Settings)}
+        for keyword in WorldArguments.__annotations__:
+            default = re.escape(own.get(keyword, "None"))
+            assert re.search(rf"\b{keyword}: [^=]+ = {default}", words), keyword
         assert "**world" not in words
+
+
+def test_each_setting_of_worlds_is_a_keyword_with_a_row_in_the_table() -> None:
+    defaults = json.loads(_native.CheckedSettings("{}").settings)
+    kinds = get_type_hints(WorldArguments)
+    table = f"{emberwatch.WildfireEnv.__doc__}{emberwatch.WildfireVectorEnv.__doc__}"
+    own = get_type_hints(Settings)
+    of_worlds = _native.world_settings()
+    assert of_worlds.pop("max_steps"), "Gymnasium's max_episode_steps"
+    keywords = {"n_moves" if name == "moves" else name: name for name in of_worlds}
+    assert kinds.keys() == {*own, *keywords} - {"reveals", "worlds"}, "keywords of WorldArguments"
+    assert own.items() - kinds.items() == {("reveals", bool), ("worlds", dict[str, object])}
+    for keyword, name in keywords.items():
+        default = defaults[name]
+        assert {type(default), NoneType} <= {*get_args(kinds[keyword])}, keyword
+        shown = f"{default:,}" if type(default) is int else json.dumps(default).capitalize()
+        row = rf"`{keyword}` \(`?{re.escape(shown)}`?[:)]"
+        assert re.search(row, table), f"the docstring lacks a row: `{keyword}` ({shown})"
 
 
 def test_ages_count_the_steps_since_a_cell_was_seen() -> None:
@@ -184,14 +206,15 @@ def test_resume_continues_another_agents_episode() -> None:
 IMPOSSIBLE: list[tuple[dict[str, Any], str]] = [
     ({"observation": ()}, r"expected one or several of frame, image, .*, others, got \(\)"),
     *(({"observation": it}, "observation") for it in (["frame", "frame"], ["frame", "visited"])),
-    *(({"height": it}, f"^height: expected 1 to 4096, got {it}$") for it in (0, -1)),
-    ({"height": 10**30}, "^height: expected 1 to 4096, got 1e"),
-    ({"height": "7"}, r"height: expected int \| None, got '7'"),
-    ({"height": True}, "height: expected .* got True"),
-    *(({"sensor_radius": it}, f"sensor_radius: .* got {it!r}") for it in (-1, 9, 1.5, "1")),
+    *(
+        ({"height": it}, f"^height: expected an integer within 1 to 4096, got {it!r}$")
+        for it in (0, -1, 10**30, "7", True)
+    ),
+    *(({"sensor_radius": it}, f"sensor_radius: .* got {it!r}") for it in (-2, 9, 1.5, "1")),
+    ({"states_symmetries": 1}, r"^states_symmetries: expected bool \| None, got 1$"),
     ({"states": "jacksboro"}, "^model: expected to be left out, as the states file decides it"),
-    ({"n_moves": 2.5}, r"n_moves: expected int \| None, got 2.5"),
-    ({"burn_in": -1}, "^burn_in: expected 0 to 1099511627776, got -1$"),
+    ({"n_moves": 2.5}, "^n_moves: expected an integer within 1 to 4096, got 2.5"),
+    ({"burn_in": -1}, "^burn_in: expected an integer within 0 to 1099511627776, got -1$"),
     ({"start": "middle"}, "^start: expected corner, centre, random or ROW,COL, got middle$"),
     ({"start": "7,0"}, r"start: expected a cell on the 7 x 5 grid, got \(7, 0\)"),
     *(({"truth": it}, f"truth: expected bool, got {it!r}") for it in ("no", None)),

@@ -128,7 +128,7 @@ def test_keywords_set_by_a_task_are_refused() -> None:
     decided: dict[str, Any] = {"model": "wildfire", "states": "jacksboro", "sensor_radius": 1}
     decided |= {"states_symmetries": True, "states_offset": 3, "height": 16, "width": 16}
     decided |= {"n_moves": 16, "robots": 1, "burn_in": 3000, "start": "corner"}
-    for keyword, value in decided.items():
+    for keyword, value in (*decided.items(), ("states_symmetries", False), ("states_offset", 0)):
         with refuses(f"{keyword}: expected to be left out, as the task decides it, got"):
             gymnasium.make("emberwatch/WildfireSmall-v0", **{keyword: value})
     env = closed_later(gymnasium.make(WILDFIRE, task="small"))

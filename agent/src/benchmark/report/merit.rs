@@ -3,16 +3,17 @@
 use crate::benchmark::report::columns::Columns;
 use crate::benchmark::report::number::NOTHING;
 use crate::benchmark::report::policy_run::{Group, PolicyRun};
+use emberwatch_belief::merit::RECENT_STEPS;
 
 /// Returns the table with its heading, or `None` if the runs lack the figures of merit, as runs from old files do.
 ///
 /// Each difference is a policy's share of burning cells seen minus the share of `baseline`, paired by world.
 pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String> {
     let mut runs = groups.iter().flat_map(|group| &group.runs);
-    let recent_steps = runs.find_map(|run| run.recent_steps)?;
+    runs.find_map(|run| run.grid_seen_share)?;
     let mut heading = format!(
         "Figures of merit (docs/figures-of-merit.md): time to detection among the worlds where fire \
-         was detected; burning\ncells seen in the last {recent_steps} steps; front: moves to the \
+         was detected; burning\ncells seen in the last {RECENT_STEPS} steps; front: moves to the \
          nearest burning cell not seen in these.\n"
     );
     if groups

@@ -38,16 +38,14 @@ pub struct PolicyRun {
     /// Share of the robots' visits to distinct cells that repeat a teammate's visit in the same step, in `0..1`.
     #[serde(default)]
     pub mean_repeated: f64,
-    /// Steps until a robot first visited a burning cell, `None` if never. This and the next five fields are defined in
+    /// Steps until a robot first visited a burning cell, `None` if never. This and the next four fields are defined in
     /// `docs/figures-of-merit.md`.
     pub steps_to_detection: Option<u64>,
     /// Number of burning cells in the world at that step.
     pub burning_cells_at_detection: Option<u32>,
-    /// Steps for which a cell counts as seen after a visit.
-    pub recent_steps: Option<u32>,
-    /// Share of the burning cells that were seen in the last `recent_steps` steps.
+    /// Share of the burning cells that were seen in the last 10 steps.
     pub burning_seen_share: Option<f64>,
-    /// Moves from the nearest robot to the nearest burning cell that was not seen in the last `recent_steps` steps.
+    /// Moves from the nearest robot to the nearest burning cell that was not seen in the last 10 steps.
     pub front_distance: Option<f64>,
     /// Share of the grid's cells that were ever seen.
     pub grid_seen_share: Option<f64>,

@@ -74,6 +74,12 @@ MAX_VALUES: int
 def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
     """Returns the texts of built-in files by name; `states` are descriptions of recorded states."""
 
+def world_settings() -> dict[str, tuple[int, int] | None]:
+    """Returns the range of each setting of worlds, by its name in `config/server.toml`.
+
+    The range is None unless the setting is a number.
+    """
+
 def explain(status: int, detail: int) -> tuple[str, str] | None:
     """Returns the name and the message of a status code; None if the code is not a refusal."""
 
@@ -530,9 +536,7 @@ def beam_search(
 class MeritTally:
     """Running figures of merit of several worlds."""
 
-    def __new__(
-        cls, n_worlds: int, height: int, width: int, target: int, recent_steps: int
-    ) -> MeritTally: ...
+    def __new__(cls, n_worlds: int, height: int, width: int, target: int) -> MeritTally: ...
     def update(
         self,
         visited: NDArray[np.bool_],

@@ -5,15 +5,11 @@ states.
 """
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 import emberwatch._native as _native
-
-#: Default number of steps for which a cell counts as seen after a visit.
-RECENT_STEPS: Final = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,8 +20,8 @@ class Merit:
     steps_to_detection: int | None
     #: Number of the world's burning cells in the step of that first visit.
     burning_cells_at_detection: int | None
-    #: Share of the burning cells that count as seen, because a robot visited them in the last
-    #: `recent_steps` steps. Mean over the steps in which cells burn.
+    #: Share of the burning cells that count as seen, because a robot visited them in the last 10
+    #: steps. Mean over the steps in which cells burn.
     burning_seen_share: float | None
     #: Smallest number of moves from a robot to a burning cell that does not count as seen. Mean
     #: over the steps that have such a cell.
@@ -37,11 +33,9 @@ class Merit:
 class MeritTally:
     """Running figures of merit of several worlds that step together."""
 
-    def __init__(
-        self, n_worlds: int, shape: tuple[int, int], *, target: int, recent_steps: int
-    ) -> None:
-        """Starts without steps. `target` is the burning state; `recent_steps` is at least 1."""
-        self._tally = _native.MeritTally(n_worlds, *shape, target, recent_steps)
+    def __init__(self, n_worlds: int, shape: tuple[int, int], *, target: int) -> None:
+        """Starts without steps. `target` is the burning state."""
+        self._tally = _native.MeritTally(n_worlds, *shape, target)
 
     def update(
         self,

@@ -15,7 +15,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emberwatch.belief.merit import RECENT_STEPS
 from emberwatch.benchmark.policies import Actor, Policy
 from emberwatch.benchmark.report import Progress
 from emberwatch.benchmark.rows import Row, RowFile
@@ -25,6 +24,7 @@ from emberwatch.client.client import Client
 from emberwatch.common.arguments import as_count, as_list, as_seed
 from emberwatch.common.paths import with_absolute_paths
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
+from emberwatch.envs.path_env import WildfireVectorEnv
 from emberwatch.envs.settings import Settings, WorldArguments
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model.tasks import Task
@@ -119,7 +119,6 @@ def evaluate(
         "robots": n_robots,
         "team": "shared" if n_robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,
-        "recent_steps": RECENT_STEPS,
         "worlds_fingerprint": fingerprint,
     }
     played = {(fingerprint, seed, steps) for seed in chosen}
@@ -154,8 +153,8 @@ def _with_defaults(
         keywords.setdefault("truth", info.publish_truth)
         return keywords, info.n_robots, info.worlds_fingerprint or ""
     keywords.setdefault("truth", True)  # worlds in this process can always reveal it
-    world = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
-    fingerprint = Settings(**world).read().worlds_fingerprint
+    world: Any = {it: keywords[it] for it in WorldArguments.__annotations__ if it in keywords}
+    fingerprint = Settings.of(WildfireVectorEnv, world).read().worlds_fingerprint
     return keywords, keywords.get("robots") or (task.robots if task else 1), fingerprint
 
 

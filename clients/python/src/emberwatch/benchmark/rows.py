@@ -57,7 +57,6 @@ class Row:
     mean_repeated: float = 0.0
     steps_to_detection: int | None = None
     burning_cells_at_detection: int | None = None
-    recent_steps: int | None = None
     burning_seen_share: float | None = None
     front_distance: float | None = None
     grid_seen_share: float | None = None

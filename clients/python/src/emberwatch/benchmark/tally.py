@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief.merit import RECENT_STEPS, MeritTally
+from emberwatch.belief.merit import MeritTally
 from emberwatch.benchmark.rows import Row
 from emberwatch.envs.observations import cells_of
 from emberwatch.envs.settings import WorldSpec
@@ -23,7 +23,7 @@ class Tally:
         self._spec: Final = spec
         target = 0 if spec.described is None else spec.described.target_state
         grid = spec.height, spec.width
-        self._merit = MeritTally(n_worlds, grid, target=target, recent_steps=RECENT_STEPS)
+        self._merit = MeritTally(n_worlds, grid, target=target)
         self._reward = np.zeros(n_worlds)
         counts = np.zeros((4, n_worlds), np.int64)
         self._n_visited, self._n_visits, self._n_hits, self._n_fire = counts

@@ -108,7 +108,9 @@ class WildfireEnv(WorldEnv):
     ## Arguments
 
     All arguments are keywords of `gymnasium.make("emberwatch/Wildfire-v0", ...)`. Defaults are in
-    parentheses.
+    parentheses. From `model` to `states_offset`, None is the default, or with `instance` the value
+    of the running server; another value of `model`, `start` or of recorded states is refused with
+    `instance`, except for `model` if the server hides it.
 
     * `observation`: the parts of the observation (`("frame", "robot")`).
     * `reward`: `"share"`, `"team"` or `"marginal"` (`"share"`).
@@ -124,15 +126,19 @@ class WildfireEnv(WorldEnv):
       (`docs/environments/index.md` lists tasks and models). A task determines `robots`, all
       keywords from `model` to `states_offset`, and the length of episodes, so none of them may be
       given with it. With `instance`, it must be the task of the running server.
-    * `model`: a `Model`, the name of a built-in one (`"wildfire"`), or the path or the text of a
+    * `model` (`"wildfire"`): a `Model`, the name of a built-in one, or the path or the text of a
       model file. All files are read once, when the environment is made.
-    * `height`, `width` (64), `n_moves` (64; the T above), `burn_in` (10,000), `sensor_radius`
-      (None: the model's), `start` (`"corner"`; or `"centre"`, `"random"`, `"ROW,COL"`): for worlds
-      in this process. With `instance`, leave them out or repeat the server's values.
-    * `states`: recorded states instead of a model: the name of built-in states, a `.npz` or `.npy`
-      file, or a folder (see `docs/recorded-worlds.md`). Recorded states determine `height`, `width`
-      and `burn_in`, and an episode is truncated at their last step.
-    * `states_symmetries` (False), `states_offset` (0): how episodes are made of recorded states.
+    * `height` (64), `width` (64): the grid in cells.
+    * `n_moves` (64): number of moves in a path, the T above.
+    * `burn_in` (10,000): number of steps that the world is simulated before k = 0.
+    * `sensor_radius` (-1): number of rows and columns that the robot sees beyond each cell of its
+      path; -1: the model's.
+    * `start` (`"corner"`): the robot's first cell: `"corner"`, `"centre"`, `"random"`, `"ROW,COL"`.
+    * `states` (`""`: none): recorded states instead of a model: the name of built-in states, a
+      `.npz` or `.npy` file, or a folder (see `docs/recorded-worlds.md`). Recorded states determine
+      `model`, `height`, `width` and `burn_in`, and an episode is truncated at their last step.
+    * `states_symmetries` (False): whether the seed also selects a symmetry of the recorded grid.
+    * `states_offset` (0): maximum recorded step at which an episode begins; the seed draws one.
     * `truth`: whether to reveal the hidden states in `info` and pictures (False).
     * `timeout`: seconds to wait for a step of a running server, and for the server to start (5).
     * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.
@@ -232,7 +238,7 @@ class WildfireVectorEnv(WorldVectorEnv):
     Takes the arguments of `WildfireEnv`, and:
 
     * `num_envs`: number of robots, a multiple of `robots`. None: the robots of one world.
-    * `robots`: number of robots of each world (1). The robots of a world begin and end their
+    * `robots` (1): number of robots of each world. The robots of a world begin and end their
       episodes together.
     * `max_episode_steps`: number of steps after which episodes are truncated; None or -1: never.
     * `autoreset_mode`: a `gymnasium.vector.AutoresetMode`; `NEXT_STEP` by default.

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Any, Final, TypedDict, TypeVar, cast, get_type_hints
+from types import NoneType
+from typing import Any, Final, TypedDict, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 
@@ -17,8 +18,7 @@ import emberwatch._native as _native
 from emberwatch.client.connection import STEP_TIMEOUT
 from emberwatch.client.replies import ServerInfo
 from emberwatch.client.wire import Shape
-from emberwatch.common.arguments import read_settings
-from emberwatch.common.paths import utf8
+from emberwatch.common.arguments import as_count, read_settings
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace
@@ -45,7 +45,10 @@ _Init = TypeVar("_Init")
 
 
 class WorldArguments(TypedDict, total=False):
-    """The types of the keywords, for type checkers; `Settings` has the defaults."""
+    """The shared keywords and their types.
+
+    Tests compare them with the settings of worlds that the native module declares.
+    """
 
     instance: str | None
     world: int
@@ -55,8 +58,8 @@ class WorldArguments(TypedDict, total=False):
     task: str | Path | None
     model: Model | str | Path | None
     states: str | Path | None
-    states_symmetries: bool
-    states_offset: int
+    states_symmetries: bool | None
+    states_offset: int | None
     height: int | None
     width: int | None
     n_moves: int | None
@@ -68,55 +71,32 @@ class WorldArguments(TypedDict, total=False):
     render_mode: str | None
 
 
+_KINDS: Final[dict[str, Any]] = get_type_hints(WorldArguments)
+
+#: The settings of worlds by keyword: their names in `config/server.toml`, and ranges of numbers.
+_OF_WORLDS: Final = {
+    _KEYWORDS.get(name, name): (name, limits) for name, limits in _native.world_settings().items()
+}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """The keywords that `WildfireEnv` explains. None means the default, or the server's value."""
+    """The checked values of the keywords that `WildfireEnv` explains."""
 
     instance: str | None = None
     world: int = 0
     robot: int | None = None
-    robots: int | None = None
     takeover: bool = False
     task: str | Path | None = None
-    model: Model | str | Path | None = None
-    states: str | Path | None = None
-    states_symmetries: bool = False
-    states_offset: int = 0
-    height: int | None = None
-    width: int | None = None
-    n_moves: int | None = None
-    burn_in: int | None = None
-    sensor_radius: int | None = None
-    start: str | None = None
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
     #: Whether infos and pictures show the hidden states. Even if False, `truth` may be set, for
     #: rewards that need the hidden states.
     reveals: bool = False
-
-    def __post_init__(self) -> None:
-        kinds = get_type_hints(Settings)
-        for each in fields(self):
-            value: Any = getattr(self, each.name)
-            kind = kinds[each.name]
-            if isinstance(value, np.generic):
-                value = cast("Any", value.item())
-                object.__setattr__(self, each.name, value)
-            is_kind = isinstance(value, int | float if kind is float else kind)
-            if not is_kind or (isinstance(value, bool) and kind is not bool):
-                raise invalid(each.name, each.type, repr_of(value))
-        for name in ("task", "model", "states", "start"):
-            value = getattr(self, name)
-            if isinstance(value, str | Path):
-                utf8(name, value)
-        if self.sensor_radius is not None and not 0 <= self.sensor_radius <= _native.MAX_RADIUS:
-            expected = f"0 to {_native.MAX_RADIUS}, or None"
-            raise invalid("sensor_radius", expected, self.sensor_radius)
-        if self.robots is not None and self.robots < 1:
-            raise invalid("robots", "at least 1", self.robots)
-        if not self.timeout > 0:
-            raise invalid("timeout", "seconds above 0", self.timeout)
+    #: The other keywords, which are settings of worlds, by their names in `config/server.toml`.
+    #: Without those that are None: the default, or the server's value.
+    worlds: dict[str, object]
 
     @classmethod
     def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
@@ -125,43 +105,51 @@ class Settings:
         Raises:
             TypeError: If a keyword is unknown. The message names the most similar keyword, and all
                 known ones.
+            InvalidArgumentError: If a value has the wrong type, or a number is out of range.
         """
         parameters = signature(environment).parameters.values()
         known = {each.name for each in parameters if each.kind is each.KEYWORD_ONLY}
-        for name in world:
-            if name not in known:
-                alike = get_close_matches(name, known, 1)
+        own: dict[str, Any] = {}
+        worlds: dict[str, object] = {}
+        for keyword, value in world.items():
+            if keyword not in known:
+                alike = get_close_matches(keyword, known, 1)
                 hint = f" (did you mean {alike[0]!r}?)" if alike else ""
-                hint = _REMOVED.get(name, hint)
+                hint = _REMOVED.get(keyword, hint)
                 # This is Python's own message, which TorchRL parses to find a keyword to leave out.
                 raise TypeError(
                     f"{environment.__name__}() got an unexpected keyword argument "
-                    f"{repr_of(name)}{hint}; known keywords: {', '.join(sorted(known))}"
+                    f"{repr_of(keyword)}{hint}; known keywords: {', '.join(sorted(known))}"
                 )
-        asked = cls(**world)
-        return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
+            name, limits = _OF_WORLDS.get(keyword, (None, None))
+            value = _checked(keyword, value, limits)
+            if name is None:
+                own[keyword] = value
+            elif value is not None:
+                worlds[name] = value
+        if not own.get("timeout", STEP_TIMEOUT) > 0:
+            raise invalid("timeout", "seconds above 0", own["timeout"])
+        reveals = own.pop("truth", False)
+        return cls(**own, truth=reveals or needs_truth, reveals=reveals, worlds=worlds)
 
     def read(self) -> _native.CheckedSettings:
         """Checks the settings of one world, and reads their files. Errors name keywords."""
-        given = {
-            "robots": self.robots,
-            "task": self.task,
-            "model": self.model,
-            "states": self.states,
-            "height": self.height,
-            "width": self.width,
-            "moves": self.n_moves,
-            "burn_in": self.burn_in,
-            "sensor_radius": self.sensor_radius,
-            "start": self.start,
-            "publish_truth": self.truth,
-            # Default values are left out, because a server refuses these settings without recorded
-            # states.
-            "states_symmetries": self.states_symmetries or None,
-            "states_offset": self.states_offset or None,
-        }
         with _names_keywords():
-            return read_settings(given)
+            return read_settings({"task": self.task, "publish_truth": self.truth, **self.worlds})
+
+
+def _checked(keyword: str, value: Any, limits: tuple[int, int] | None) -> Any:
+    """Returns a keyword's value as a plain Python object; checks its type and range."""
+    if limits is not None and value is not None:
+        return as_count(value, keyword, *limits)
+    if isinstance(value, np.generic):
+        value = cast("Any", value.item())
+    kinds = get_args(_KINDS[keyword]) or (_KINDS[keyword],)
+    is_kind = isinstance(value, (*kinds, int) if float in kinds else kinds)
+    if not is_kind or (isinstance(value, bool) and bool not in kinds):
+        names = ("None" if kind is NoneType else kind.__name__ for kind in kinds)
+        raise invalid(keyword, " | ".join(names), repr_of(value))
+    return value
 
 
 @contextmanager
@@ -179,13 +167,10 @@ def shows_keywords(init: _Init) -> _Init:
     """Replaces ``**world`` in a signature with keywords and defaults, for `help` and editors."""
     plain: Any = init
     own = signature(plain).parameters.values()
-    kinds = get_type_hints(Settings)
+    defaults = {each.name: each.default for each in fields(Settings)}
     shared = [
-        Parameter(
-            each.name, Parameter.KEYWORD_ONLY, default=each.default, annotation=kinds[each.name]
-        )
-        for each in fields(Settings)
-        if each.name in WorldArguments.__annotations__
+        Parameter(name, Parameter.KEYWORD_ONLY, default=defaults.get(name), annotation=kind)
+        for name, kind in _KINDS.items()
     ]
     plain.__signature__ = Signature(
         [*(each for each in own if each.kind is not each.VAR_KEYWORD), *shared]
@@ -280,23 +265,19 @@ def running_spec(
     Raises:
         InvalidArgumentError: If the settings do not match the server.
     """
-    own = ("start", None), ("states", None), ("states_symmetries", False), ("states_offset", 0)
-    for name, default in own:
-        if getattr(settings, name) != default:
-            raise InvalidArgumentError(
-                f"{name}: expected {default} (the default), as the running server determines it"
-            )
     task = built_in_tasks().get(info.task or "")
     if settings.task is not None:
         task = _check_task(settings.task, info)
-    if settings.model is not None and info.model is not None:
-        raise InvalidArgumentError("model: expected None, as the running server reveals its model")
-    known = {name: getattr(info, name) for name in ("height", "width", "n_moves", "burn_in")}
-    known |= {"robots": info.n_robots, "sensor_radius": info.airspace.radius}
-    for name, has in known.items():
-        asked = getattr(settings, name)
-        if asked not in (None, has):
-            raise invalid(name, f"the server's {has}, or None", asked)
+    served = _served(info) | {"sensor_radius": info.airspace.radius}
+    for name, asked in settings.worlds.items():
+        keyword = _KEYWORDS.get(name, name)
+        if name == "model":
+            if info.model is not None:
+                raise invalid(keyword, "None, as the running server reveals its model", asked)
+        elif name not in served:
+            raise invalid(keyword, "None, as the running server determines it", repr_of(asked))
+        elif asked != served[name]:
+            raise invalid(keyword, f"the server's {served[name]}, or None", asked)
     robots = _robots(settings, n_rows, info.n_robots)
     first, last = settings.world, (robots.stop - 1) // info.n_robots
     if not 0 <= first <= last < info.n_worlds:
@@ -305,8 +286,9 @@ def running_spec(
     if settings.truth and not info.publish_truth:
         raise invalid("truth", "a server started with --publish-truth", "one without")
     model = None if info.model is None else Model.from_toml(info.model)
-    if settings.model is not None:
-        model = Model.named(settings.model).with_radius(info.airspace.radius)
+    if "model" in settings.worlds:
+        asked: Any = settings.worlds["model"]
+        model = Model.named(asked).with_radius(info.airspace.radius)
         has, got = (info.n_observations, info.airspace), (model.n_observations, model.airspace)
         if has != got:
             raise invalid("model", f"the server's sensor and no-fly cells, {has}", f"{got}")
@@ -329,6 +311,18 @@ def running_spec(
     return spec, robots
 
 
+def _served(info: ServerInfo) -> dict[str, int]:
+    """Returns the settings of worlds that a running server reports, by name."""
+    return {
+        "height": info.height,
+        "width": info.width,
+        "moves": info.n_moves,
+        "robots": info.n_robots,
+        "burn_in": info.burn_in,
+        "max_steps": info.max_steps,
+    }
+
+
 def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     """Returns the task; refuses a server of another task, or with worlds that differ from it."""
     read = read_settings({"task": asked})
@@ -337,22 +331,20 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     if task.name != info.task:
         raise invalid("task", f"the server's {info.task!r}, or None", repr_of(task.name))
     own: dict[str, Any] = json.loads(read.settings)
-    has = {"moves": info.n_moves, "robots": info.n_robots, "max_steps": info.max_steps}
-    has |= {"height": info.height, "width": info.width, "burn_in": info.burn_in}
-    for name, got in has.items():
-        if own[name] != got:
-            raise invalid(f"{name} of task {task.name!r}", f"the server's {got}", own[name])
+    for name, served in _served(info).items():
+        if own[name] != served:
+            raise invalid(f"{name} of task {task.name!r}", f"the server's {served}", own[name])
     described = _described(read, own)
     if described.sensor_radius != info.airspace.radius:
         expected = f"the server's {info.airspace.radius}"
         name = f"sensor_radius of task {task.name!r}"
         raise invalid(name, expected, described.sensor_radius)
-    served: Description | None = info.recorded_states
-    if served is not None:
-        served = served.with_radius(info.airspace.radius)
+    shown: Description | None = info.recorded_states
+    if shown is not None:
+        shown = shown.with_radius(info.airspace.radius)
     elif info.model is not None:
-        served = Model.from_toml(info.model)
-    if served not in (None, described):
+        shown = Model.from_toml(info.model)
+    if shown not in (None, described):
         raise invalid(f"states of task {task.name!r}", "the server's states", described.name)
     return task
 
