@@ -23,7 +23,7 @@ pub const KNOWN: BeliefKind = BeliefKind {
 
 pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
     name: "known+cavities",
-    about: "known; with hazards, without a cell's influence on itself",
+    about: "known, without a cell's influence on itself; with a kernel, the same as known",
     handover: Some(|model| BayesFilter::handover_of_known(model, true)),
     build: |conditions| Ok(Box::new(filter(conditions, true)?)),
     ..KNOWN
@@ -39,7 +39,7 @@ pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
 
 pub const KNOWN_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "known+spatial+cavities",
-    about: "known+spatial, predicting like known+cavities",
+    about: "known+spatial, without a cell's influence on itself; with a kernel, the same as known+spatial",
     handover: Some(|model| spatial_handover(model, true)),
     build: |conditions| Ok(Box::new(spatial(conditions, true)?)),
     ..KNOWN

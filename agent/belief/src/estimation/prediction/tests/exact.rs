@@ -103,8 +103,8 @@ impl Exact {
 }
 
 /// Simulates worlds whose first cell starts in state 1. For predictions without and with cavities, returns the
-/// Kullback-Leibler divergence of the beliefs from the exact beliefs, as the mean over steps and cells. Frames show each cell with
-/// probability `1 / one_in`. If `one_in` is 0, frames show no cells.
+/// Kullback-Leibler divergence of the beliefs from the exact beliefs, as the mean over steps and cells. Frames show each
+/// cell with probability `1 / one_in`. If `one_in` is 0, frames show no cells.
 pub fn divergences(model: &Model, shape: Shape, one_in: u64, n_worlds: u64) -> [f64; 2] {
     let mut states = Grid::zeros(shape.dim());
     states[[0, 0]] = 1;
