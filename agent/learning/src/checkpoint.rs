@@ -1,6 +1,6 @@
-//! Checkpoints: what a learner has learned, in one safetensors file. Weights and the optimiser's moments are named
-//! tensors. Counters and estimates are encoded with bincode in the byte tensor `state`. Replay buffers and the beliefs
-//! of robots are not saved: a resumed training fills and begins them again.
+//! Checkpoints of learners, each in one safetensors file. Weights and the optimiser's moments are named tensors.
+//! Counters and estimates are encoded with bincode in the byte tensor `state`. Replay buffers and the beliefs of robots
+//! are not saved: a resumed training fills and begins them again.
 //!
 //! A checkpoint is written to a temporary file and renamed, so that readers always find a complete file. The file
 //! records its kind of learner and its format, and contains a digest that reveals damage. Equal contents produce equal

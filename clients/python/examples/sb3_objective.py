@@ -2,7 +2,7 @@ r"""Replaces the paper's high-level decision with Stable-Baselines3's DQN.
 
 Belief and plans stay in Rust. The DQN sees the features of eight plans and chooses the plan to fly.
 One small network scores every plan from its features, so that all plans share the weights. The
-choice matters most where fires are rare and hidden, on the belief of a learned filter:
+choice matters on `burnout` and `latent`. On the belief of a learned filter:
 
     emberwatch-agent train --learner filter --steps 12000 --model wildfire-latent --moves 12 \
         --burn-in 6000 --out filter

@@ -56,8 +56,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     * `estimator`: the kind of belief, one that `emberwatch.belief.kinds` lists with `has_options`.
       The default is the kind that `checkpoint` contains, or `emberwatch.belief.RECOMMENDED` without
-      a checkpoint. If fires are rare, learned estimators find several times as many burning cells
-      as estimators with a known model.
+      a checkpoint.
     * `checkpoint`: the file that `emberwatch-agent train` saved, for learned estimators.
     * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; its
       first computation takes about a second), `"initial"` or `"uniform"`.

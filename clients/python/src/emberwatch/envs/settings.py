@@ -95,7 +95,7 @@ class Settings:
     #: rewards that need the hidden states.
     reveals: bool = False
     #: The other keywords, which are settings of worlds, by their names in `config/server.toml`.
-    #: Without those that are None: the default, or the server's value.
+    #: A keyword that is None is left out: the default, or the server's value.
     worlds: dict[str, object]
 
     @classmethod
