@@ -4,10 +4,11 @@ use super::shared::{make_folder, parse_seconds};
 use super::worlds::{BURN_IN, SimulationFlags};
 use crate::benchmark::report::training::draw_training;
 use crate::client::worlds::Worlds;
-use crate::flags::{AgentFlags, Preset, one_of, one_of_names};
+use crate::flags::{AgentFlags, Preset};
 use crate::training::{CHECKPOINT, TrainingSpec, train};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser};
 use emberwatch_learning::beliefs::{self, BeliefKind, LEARNED};
 use emberwatch_learning::checkpoint::Contents;
 use emberwatch_learning::config::AgentConfig;
@@ -30,21 +31,11 @@ use std::time::{Duration, Instant};
 /// Default number of training worlds, except for a learner that follows a single world.
 pub(super) const N_WORLDS: u32 = 16;
 
-/// The values of `--coverage`. Each consists of whether frames show every cell, the value's name, and its help text.
-const COVERAGES: [(bool, &str, &str); 2] = [
-    (false, "path", "The cells in sight of the path"),
-    (
-        true,
-        "full",
-        "Every cell, if the server's coverage is `client` or `full`",
-    ),
-];
-
 /// Learn a model while acting.
 #[derive(Args)]
 pub struct TrainCommand {
     /// What to learn [default: filter; with --preset paper: autoencoder]
-    #[arg(long, value_parser = one_of_names(LEARNERS.iter().map(|kind| (kind.name, kind.about))))]
+    #[arg(long, value_parser = PossibleValuesParser::new(LEARNERS.iter().map(|kind| PossibleValue::new(kind.name).help(kind.about))))]
     learner: Option<String>,
     /// Folder for checkpoint.safetensors, metrics.csv and training.svg, with a subfolder for an estimator trained first
     #[arg(long, value_name = "DIR")]
@@ -66,9 +57,10 @@ pub struct TrainCommand {
     /// Maximum seconds to act, including the training of an estimator
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
-    /// Cells that frames show to a filter in training [default: from the settings; with --resume: the checkpoint's]
-    #[arg(long = "coverage", value_name = "CELLS", value_parser = one_of(&COVERAGES))]
-    full_frames: Option<bool>,
+    /// Cells that frames show to a filter in training: path (those in sight of the path) or full (every cell, if the
+    /// server's coverage is `client` or `full`) [default: from the settings; with --resume: the checkpoint's]
+    #[arg(long, value_name = "CELLS", value_parser = ["path", "full"])]
+    coverage: Option<String>,
     /// Device for an autoencoder or a neural belief: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
@@ -127,13 +119,13 @@ impl TrainCommand {
             config.decisions.estimator = estimator.name.into();
         }
         let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
-        if let Some(full_frames) = self.full_frames {
+        if let Some(coverage) = &self.coverage {
             ensure!(
                 *kind == FILTER,
                 "--coverage applies only with --learner filter, got --learner {}",
                 kind.name
             );
-            config.full_frames = full_frames;
+            config.full_frames = coverage == "full";
         }
         let n_worlds = self
             .worlds
@@ -211,12 +203,15 @@ impl TrainCommand {
         if let Some(contents) = &contents {
             self.check_no_checkpoint()?;
             (kind.adopt)(contents, &mut training.config);
-            let (expected, got) = (training.config.full_frames, self.full_frames);
+            let expected = if training.config.full_frames {
+                "full"
+            } else {
+                "path"
+            };
+            let got = self.coverage.as_deref().unwrap_or(expected);
             ensure!(
-                got.is_none_or(|got| got == expected),
-                "--coverage: expected {} as in the checkpoint, got {}",
-                COVERAGES[usize::from(expected)].1,
-                COVERAGES[usize::from(!expected)].1
+                got == expected,
+                "--coverage: expected {expected} as in the checkpoint, got {got}"
             );
             if decides(kind) {
                 let belief = contents.state::<SavedDecisions>()?.kind()?;
