@@ -5,12 +5,12 @@ use crate::benchmark::report::merit::merit_table;
 use crate::benchmark::report::number::{NOTHING, decimals, number};
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::ratio_of_means;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// Estimator label of the oracles. The table shows rewards as a percentage of the best oracle's reward.
 const TRUTH: &str = "truth";
 
-/// Renders the rewards and figures of merit of every policy over all worlds, then the rewards by amount of fire.
+/// Renders the rewards and figures of merit of every policy over all worlds.
 ///
 /// Policies keep their order. `baseline` names the policy that paired differences are relative to.
 pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
@@ -21,9 +21,8 @@ pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
     let heading = heading(runs, &groups, baseline);
     let summary = summary(&groups, baseline);
     let merit = merit_table(&groups, baseline);
-    let merit = merit.map_or(String::new(), |table| format!("{table}\n\n"));
-    let split = split_by_fire(runs, &groups);
-    format!("{heading}\n\n{summary}\n\n{merit}{split}\n")
+    let merit = merit.map_or(String::new(), |table| format!("\n{table}\n"));
+    format!("{heading}\n\n{summary}\n{merit}")
 }
 
 fn heading(runs: &[PolicyRun], groups: &[Group<'_>], baseline: &str) -> String {
@@ -92,42 +91,6 @@ fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
     let ratio =
         oracle.and_then(|oracle| ratio_of_means(&group.by_seed(reward), &oracle.by_seed(reward)));
     ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
-}
-
-/// Renders mean rewards over the half of the worlds with less fire, and over the half with more fire. If the number of
-/// worlds is odd, the middle world belongs to the half with more fire.
-fn split_by_fire(runs: &[PolicyRun], groups: &[Group<'_>]) -> String {
-    let mut fire_of: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
-    for run in runs {
-        let fires = fire_of.entry(run.world_seed).or_default();
-        fires.push(run.mean_fire_cells);
-    }
-    let mean = |fires: &Vec<f64>| fires.iter().sum::<f64>() / fires.len() as f64;
-    let worlds = fire_of.iter().map(|(&seed, fires)| (mean(fires), seed));
-    let mut worlds: Vec<(f64, u64)> = worlds.collect();
-    worlds.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    let (less, more) = worlds.split_at(worlds.len() / 2);
-    let Some((below, _)) = less.last() else {
-        return "No split by fire: one world has no halves.".into();
-    };
-    let median = if less.len() == more.len() {
-        (below + more[0].0) / 2.0
-    } else {
-        more[0].0
-    };
-    let decimals = decimals(groups.iter().flat_map(rewards));
-    let mut columns = Columns::of_names(groups);
-    for (name, half) in [("less", less), ("more", more)] {
-        let is_in = |run: &PolicyRun| half.iter().any(|world| world.1 == run.world_seed);
-        let heading = format!("{name} fire ({})", counted(half.len(), "world"));
-        let value = move |run: &PolicyRun| reward(run).filter(|_| is_in(run));
-        columns.add_estimate(&heading, decimals, &value);
-    }
-    format!(
-        "Mean reward by fire, split at the median of {} burning cells:\n\n{}",
-        number(median, 1),
-        columns.table()
-    )
 }
 
 fn counted(n: usize, what: &str) -> String {
