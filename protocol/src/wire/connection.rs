@@ -14,7 +14,6 @@ use emberwatch_messages::control::{Reply, Request, ServerInfo};
 use emberwatch_messages::errors::{check_answer, garbled};
 use emberwatch_messages::message::{StepReply, StepRequest, VERSION};
 use emberwatch_messages::payload::split_step_payload;
-use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
 pub use emberwatch_messages::errors::{ConnectionError, check_status, refused, unexpected};
@@ -107,23 +106,6 @@ impl Connection {
         timeout: Duration,
     ) -> Result<Reply, ConnectionError> {
         Backend::control(self, request, timeout)
-    }
-
-    /// Returns a descriptor that is readable when the server's process has ended.
-    pub fn server_process(&self) -> BorrowedFd<'_> {
-        self.ports.texts.exchange.server_process.descriptor()
-    }
-
-    /// Checks that the server's process runs, without sending a request.
-    ///
-    /// # Errors
-    /// If the server has ended.
-    pub fn check_server(&self) -> Result<(), ConnectionError> {
-        if self.ports.texts.exchange.server_process.has_ended() {
-            Err(self.ports.texts.exchange.server_gone())
-        } else {
-            Ok(())
-        }
     }
 }
 
