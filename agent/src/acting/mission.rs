@@ -13,16 +13,14 @@ use emberwatch_protocol::connection::refused;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::model::{Description, ModelError};
-use emberwatch_protocol::task::Task;
-use std::fmt::Display;
 use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 #[derive(Debug, Clone)]
 pub struct Mission {
     pub instance: Instance,
-    /// The task that the server must run, with its model unless the task is recorded. `None` accepts any worlds.
-    pub task: Option<(Task, Option<Model>)>,
     pub world: u32,
     /// Numbers of the robots to fly in the world. They share one belief.
     pub robots: Range<u32>,
@@ -40,9 +38,15 @@ pub struct Mission {
     pub config: AgentConfig,
     /// Learned models, for policies that use them.
     pub learned: Learned,
+    /// Set when the agent must stop.
+    pub stop: Arc<AtomicBool>,
 }
 
 impl Mission {
+    pub fn is_over(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
     pub(super) fn worlds(&self) -> Range<u32> {
         self.world..self.world.saturating_add(1)
     }
@@ -52,51 +56,6 @@ impl Mission {
             takeover: self.takeover,
             ..Claim::new(numbers.clone())
         }
-    }
-
-    pub(super) fn check_task(&self, info: &ServerInfo) -> Result<()> {
-        let Some((task, model)) = &self.task else {
-            return Ok(());
-        };
-        let same = |what: &str, expected: &dyn Display, got: &dyn Display| {
-            let (expected, got) = (expected.to_string(), got.to_string());
-            let instance = self.instance.name();
-            ensure!(
-                expected == got,
-                "instance {instance:?}: expected {what} {expected}, got {got}"
-            );
-            Ok(())
-        };
-        same("task", &task.name, &info.task.as_deref().unwrap_or("none"))?;
-        let of_task = |what: &str| format!("the {what} of task {}:", task.name);
-        same(&of_task("moves"), &task.world.moves, &info.n_moves)?;
-        same(&of_task("robots"), &task.world.robots, &info.n_robots)?;
-        same(
-            &of_task("max_steps"),
-            &task.world.max_steps,
-            &info.max_steps,
-        )?;
-        let radius = |model: &Model| model.file().sensor.as_ref().map_or(0, |it| it.radius);
-        let of_model = || model.as_ref().map(radius);
-        if let Some(radius) = task.world.radius().or_else(of_model) {
-            let got = info.airspace().map_err(anyhow::Error::msg)?.radius();
-            same(&of_task("sensor_radius"), &radius, &got)?;
-        }
-        let Some(model) = model else {
-            return Ok(()); // A recorded task does not set grid, burn-in or model.
-        };
-        same(&of_task("height"), &task.world.height, &info.height)?;
-        same(&of_task("width"), &task.world.width, &info.width)?;
-        same(&of_task("burn_in"), &task.world.burn_in, &info.burn_in)?;
-        let got = info.model.as_deref().map(Model::from_toml).transpose()?;
-        ensure!(
-            got.as_ref().is_none_or(|got| got == model),
-            "instance {:?}: expected {} {}, got another model",
-            self.instance.name(),
-            of_task("model"),
-            model.file().name
-        );
-        Ok(())
     }
 
     /// Returns the numbers of the mission's robots on a server.

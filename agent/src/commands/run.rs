@@ -15,11 +15,9 @@ use emberwatch_protocol::Model;
 use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::program::stop_on_signals;
-use emberwatch_protocol::task::Task;
-use emberwatch_sim::config::{ServerConfig, model_named};
+use emberwatch_sim::config::model_named;
 use std::ops::Range;
 use std::path::PathBuf;
-use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 /// Act on one world of a running server.
@@ -56,9 +54,6 @@ pub struct RunCommand {
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
     wait: Duration,
     #[arg(long, value_name = "NAME|FILE", help = format!(
-        "Refuse the server unless it has this task: {}, or a task file", listed(Task::built_in_names())))]
-    task: Option<String>,
-    #[arg(long, value_name = "NAME|FILE", help = format!(
         "Model, if the server does not reveal it: {}, or a model file", listed(Model::built_in_names())))]
     model: Option<String>,
     /// Device for networks: cpu, cuda or metal
@@ -82,7 +77,6 @@ impl RunCommand {
         );
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
-            task: self.task.as_deref().map(task_with_model).transpose()?,
             world: self.world,
             robots: self.robots.clone(),
             team: self.team,
@@ -95,28 +89,16 @@ impl RunCommand {
             model,
             config: self.settings.effective()?,
             learned: learners::read(self.checkpoint.as_deref(), &self.device.open()?)?,
+            stop: stop_on_signals().context("handle signals")?,
         };
-        let stop = stop_on_signals().context("handle signals")?;
-        if !wait_for_server(&mission.instance, self.wait, || stop.load(Relaxed))? {
+        if !wait_for_server(&mission.instance, self.wait, || mission.is_over())? {
             return Ok(());
         }
-        let summary = run(&mission, &stop)?;
+        let summary = run(&mission)?;
         let mean_reward = summary.reward / summary.steps.max(1) as f64;
         tracing::info!(steps = summary.steps, mean_reward, "done");
         Ok(())
     }
-}
-
-/// Returns the task, with its model unless the task is recorded.
-fn task_with_model(task: &str) -> Result<(Task, Option<Model>)> {
-    let settings = ServerConfig {
-        task: task.into(),
-        ..ServerConfig::default()
-    };
-    let settings = settings.check()?;
-    let model = settings.recorded.is_none().then_some(settings.model);
-    let task = settings.task.context("invariant: a task was given")?;
-    Ok((task, model))
 }
 
 /// Parses the number of a robot, or a range.
