@@ -31,6 +31,7 @@ dance => dance
 --worlds 1024 --height 4096 --width 4096 => memory: expected | MiB for 1024 worlds of 4096 x 4096 cells | got
 status --instance nobody => no server on instance "nobody"
 stop --instance nobody => no server on instance "nobody"
+stop --json => --json
 "#;
 
 /// Invalid flags of the agent, and words of the resulting error.
