@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
 use emberwatch_protocol::program::{parse_flags, print, start_logging, stop_on_signals};
 use emberwatch_server::flags::ServerFlags;
-use emberwatch_server::server::{announce_reach, announce_uneven_weights, serve};
+use emberwatch_server::server::{announce_settings, serve};
 use std::process::ExitCode;
 
 /// Simulates worlds and serves them to agents over shared memory.
@@ -68,8 +68,7 @@ fn run(cli: &Cli) -> Result<()> {
         None => {
             let checked = cli.flags.effective()?.check()?;
             if cli.check {
-                announce_reach(&checked.reach);
-                announce_uneven_weights(&checked.model);
+                announce_settings(&checked);
                 return Ok(print(&toml::to_string(&checked.config)?)?);
             }
             let stop = stop_on_signals().context("handle signals")?;

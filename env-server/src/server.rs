@@ -17,4 +17,4 @@ mod taken;
 
 pub use ports::Ports;
 pub use serve::serve;
-pub use state::{announce_reach, announce_uneven_weights};
+pub use state::announce_settings;

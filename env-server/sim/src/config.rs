@@ -13,7 +13,7 @@ use emberwatch_model::settings;
 use emberwatch_model::settings::{ANY, SettingError, Settings, Start, WorldSettings};
 use emberwatch_model::task::{Task, TaskError};
 use emberwatch_model::text::{parse_problem, read_text, shortened};
-use emberwatch_model::{Model, Shape};
+use emberwatch_model::{Model, Ratio, Shape, TRANSITIONS_FORM};
 use serde_json::{Map, Value};
 use std::fmt::Display;
 use std::path::Path;
@@ -125,6 +125,34 @@ impl Checked {
         self.config.check_ranges()?;
         self.config.check_robots(self.shape)?;
         Ok(self)
+    }
+
+    /// Describes settings that are valid, but with which robots or filters do badly.
+    pub fn warnings(&self) -> Vec<String> {
+        let model = &self.model;
+        let mut warnings: Vec<String> = self
+            .reach
+            .closed_in
+            .iter()
+            .map(ToString::to_string)
+            .collect();
+        if model.reward().iter().all(|&reward| reward == 0.0) {
+            warnings.push(format!(
+                "model {:?}: no state pays: every reward will be 0; give a state a `reward` in the model file",
+                model.name()
+            ));
+        }
+        if let Some(uneven) = model.ratio().and_then(Ratio::uneven_place) {
+            let ([row, col], [least, most]) = (uneven.place, uneven.states);
+            let names = model.state_names();
+            warnings.push(format!(
+                "kernel: expected weights of all states within a factor of 2, got a sum of {} for {:?} and {} for \
+                 {:?} in row {row}, column {col}, so filters predict badly: write transitions instead, by which each \
+                 neighbour tries independently:\n{TRANSITIONS_FORM}",
+                uneven.weights[0], names[least], uneven.weights[1], names[most],
+            ));
+        }
+        warnings
     }
 }
 

@@ -7,10 +7,8 @@ use super::ports::{ActiveStep, Ports};
 use super::publications::Publications;
 use super::resets::Resets;
 use anyhow::Result;
-use emberwatch_protocol::Model;
 use emberwatch_protocol::control::Reply;
 use emberwatch_protocol::message::Status;
-use emberwatch_protocol::model::{Ratio, TRANSITIONS_FORM};
 use emberwatch_protocol::program::WatchedProcess;
 use emberwatch_protocol::responder::ActiveControl;
 use emberwatch_protocol::throttle::Throttle;
@@ -19,7 +17,6 @@ use emberwatch_sim::config::Checked;
 use emberwatch_sim::limits::{check_memory, n_threads, start};
 use emberwatch_sim::rate::Rate;
 use emberwatch_sim::simulator::{PendingFile, PendingReply, ResetJob, Simulator, Ticket};
-use emberwatch_sim::world::Reach;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -166,37 +163,16 @@ fn announce(checked: &Checked) {
         seed = config.seed,
         "serving"
     );
-    announce_reach(&checked.reach);
-    if checked.model.reward().iter().all(|&reward| reward == 0.0) {
-        tracing::warn!(
-            model = checked.model.name(),
-            "no state pays: every reward will be 0; give a state a `reward` in the model file"
-        );
-    }
+    announce_settings(checked);
 }
 
-/// Logs how many free cells cannot be reached from random starts, and which fixed starts are enclosed by no-fly cells.
-pub fn announce_reach(reach: &Reach) {
-    if let Some(words) = reach.cut_off() {
+/// Logs how many free cells cannot be reached from random starts, and warns of settings that do badly.
+pub fn announce_settings(checked: &Checked) {
+    if let Some(words) = checked.reach.cut_off() {
         tracing::info!("{words}");
     }
-    for closed_in in &reach.closed_in {
-        tracing::warn!("{closed_in}");
-    }
-}
-
-/// Warns of a kernel with which filters predict badly, and shows what to write instead.
-pub fn announce_uneven_weights(model: &Model) {
-    if let Some(uneven) = model.ratio().and_then(Ratio::uneven_place) {
-        let names = model.state_names();
-        let ([row, col], [least, most]) = (uneven.place, uneven.states.map(|it| &names[it]));
-        tracing::warn!(
-            "kernel: expected weights of all states within a factor of 2, got a sum of {} for {least:?} and {} for \
-             {most:?} in row {row}, column {col}, so filters predict badly: write transitions instead, by which each \
-             neighbour tries independently:\n{TRANSITIONS_FORM}",
-            uneven.weights[0],
-            uneven.weights[1],
-        );
+    for warning in checked.warnings() {
+        tracing::warn!("{warning}");
     }
 }
 
