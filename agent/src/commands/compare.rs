@@ -173,6 +173,8 @@ impl CompareCommand {
         let is_here =
             |run: &&PolicyRun| run.robots == robots || !self.robots().contains(&run.robots);
         let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
+        let fingerprint = info.worlds_fingerprint.as_deref().unwrap_or_default();
+        let worlds = comparison.worlds(fingerprint);
         for group in groups(&added) {
             let policy = group.policy;
             let mut own = comparison.policies.iter();
@@ -180,8 +182,7 @@ impl CompareCommand {
                 own.all(|own| own.name != policy),
                 "--add: policy {policy:?}: expected a name that no compared policy has"
             );
-            check_worlds(policy, group.runs.iter().copied(), &comparison.worlds(info))
-                .context("--add")?;
+            check_worlds(policy, group.runs.iter().copied(), &worlds).context("--add")?;
             ensure!(
                 group
                     .runs

@@ -22,7 +22,7 @@ use emberwatch_learning::learned::Learned;
 use emberwatch_learning::policy::{self, Policy};
 use emberwatch_protocol::task::Task;
 use emberwatch_sim::config::{Checked, ServerConfig};
-use std::ops::Range;
+use emberwatch_sim::snapshot::Settings;
 use std::path::PathBuf;
 
 /// Run policies on the test worlds of tasks, with one score per policy.
@@ -59,7 +59,6 @@ pub struct SuiteCommand {
 }
 
 impl SuiteCommand {
-    /// Performs the missing trainings and all runs, and writes the scores of all policies.
     pub fn run(&self) -> Result<()> {
         if asks_for_help(&self.policies) {
             return write(&policy::help());
@@ -101,17 +100,17 @@ impl SuiteCommand {
         if let Some(n) = self.worlds {
             seeds.end = seeds.end.min(seeds.start.saturating_add(n));
         }
-        let arena = open(settings.clone(), &seeds, 1)?;
-        let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
-        ensure!(
-            task.world.max_steps <= longest,
-            "max_steps: expected at most {longest}, the length of the shortest episode, got {}",
-            task.world.max_steps
-        );
+        if let Some(states) = &settings.recorded {
+            let (longest, got) = (states.recorded.n_steps(), task.world.max_steps);
+            ensure!(
+                got <= longest,
+                "max_steps: expected at most {longest}, the length of the shortest episode, got {got}"
+            );
+        }
         let mut policies: Vec<Policy> = Vec::new();
         let names = self.policies.iter().map(|name| &**name);
         for name in [FLOOR, CEILING].into_iter().chain(names) {
-            let policy = Policy::named(name, &arena.model)?;
+            let policy = Policy::named(name, &settings.model)?;
             if !policies.contains(&policy) {
                 policies.push(policy);
             }
@@ -136,9 +135,9 @@ impl SuiteCommand {
         let mut others = csv_files(&folder)?;
         others.retain(|file| !own.contains(file));
         Ok(Plan {
-            worlds: comparison.worlds(arena.info()),
+            worlds: comparison.worlds(&Settings::of(&settings).worlds_fingerprint()),
             comparison,
-            form: WorldForm::of(&arena.model, arena.shape()),
+            form: WorldForm::of(&settings.model, settings.shape),
             others: read_tasks(others)?,
             settings,
             folder,
@@ -149,18 +148,19 @@ impl SuiteCommand {
     /// the folder. Warns about policies that cannot run or were measured on other worlds, and leaves them out.
     fn carry_out(&self, plan: &Plan) -> Result<Vec<PolicyRun>> {
         let task = &plan.task().name;
-        let mut runs = plan.comparable();
-        let n_worlds = plan.worlds.len() as u32;
-        let mut arena = open(plan.settings.clone(), &plan.comparison.seeds, n_worlds)?;
+        let mut ready = Vec::new();
         for policy in &plan.comparison.policies {
-            let name = &policy.name;
-            let trained = match self.prepare(plan, policy) {
-                Ok(trained) => trained,
+            match self.prepare(plan, policy) {
+                Ok(trained) => ready.push((policy, trained)),
                 Err(reason) => {
-                    tracing::warn!("task {task}: {name} is not run: {reason:#}");
-                    continue;
+                    tracing::warn!("task {task}: {} is not run: {reason:#}", policy.name);
                 }
-            };
+            }
+        }
+        let mut runs = plan.comparable();
+        // Opened after all trainings, because a lease that is not used for long ends.
+        let mut arena = plan.open()?;
+        for (policy, trained) in ready {
             let comparison = Comparison {
                 policies: vec![policy.clone()],
                 learned: trained.learned,
@@ -171,7 +171,7 @@ impl SuiteCommand {
                 run.task.clone_from(task);
                 run.training_seconds = trained.seconds;
             }
-            write_runs(&plan.folder.join(file_of(name)), &new)?;
+            write_runs(&plan.folder.join(file_of(&policy.name)), &new)?;
             runs.extend(new);
         }
         Ok(runs)
@@ -199,13 +199,6 @@ impl SuiteCommand {
     }
 }
 
-/// Simulates worlds of a task, and acquires them.
-fn open(mut settings: Checked, seeds: &Range<u64>, n_worlds: u32) -> Result<Arena> {
-    settings.config.seed = seeds.start;
-    let settings = settings.with_worlds(n_worlds.min(MAX_BATCH))?;
-    Arena::open(Worlds::simulate(settings)?, n_worlds)
-}
-
 /// The policies and worlds of one task of a suite, and the rows of other policies in its folder.
 struct Plan {
     /// Settings of the task's worlds.
@@ -222,6 +215,15 @@ impl Plan {
     fn task(&self) -> &Task {
         let task = self.settings.task.as_ref();
         task.expect("invariant: a suite's settings have a task")
+    }
+
+    /// Simulates the worlds, and acquires them.
+    fn open(&self) -> Result<Arena> {
+        let n_worlds = self.worlds.len() as u32;
+        let mut settings = self.settings.clone();
+        settings.config.seed = self.comparison.seeds.start;
+        let settings = settings.with_worlds(n_worlds.min(MAX_BATCH))?;
+        Arena::open(Worlds::simulate(settings)?, n_worlds)
     }
 
     /// Returns the rows of other policies that are from this suite's worlds.
