@@ -88,7 +88,8 @@ impl CompareCommand {
         self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = learners::read(checkpoints, &self.device.open()?)?;
-        let numbers: Vec<Option<u32>> = match self.robots() {
+        let robots = self.worlds.robots();
+        let numbers: Vec<Option<u32>> = match robots.as_slice() {
             [] => vec![None],
             robots => robots.iter().copied().map(Some).collect(),
         };
@@ -169,9 +170,8 @@ impl CompareCommand {
         comparison: &Comparison,
         info: &ServerInfo,
     ) -> Result<()> {
-        let robots = info.n_robots;
-        let is_here =
-            |run: &&PolicyRun| run.robots == robots || !self.robots().contains(&run.robots);
+        let (robots, all) = (info.n_robots, self.worlds.robots());
+        let is_here = |run: &&PolicyRun| run.robots == robots || !all.contains(&run.robots);
         let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
         let fingerprint = info.worlds_fingerprint.as_deref().unwrap_or_default();
         let worlds = comparison.worlds(fingerprint);
@@ -257,15 +257,10 @@ impl CompareCommand {
         Ok(policies)
     }
 
-    /// Returns the given numbers of robots per world.
-    fn robots(&self) -> &[u32] {
-        &self.worlds.simulation.robots
-    }
-
     /// Returns whether worlds have several robots, or `--team` names other kinds than `alone`.
     fn has_teams(&self, task: Option<&Task>) -> bool {
         let of_task = task.map(|task| task.world.robots);
-        let mut robots = self.robots().iter().copied().chain(of_task);
+        let mut robots = self.worlds.robots().into_iter().chain(of_task);
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 

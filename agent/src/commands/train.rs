@@ -286,7 +286,7 @@ impl TrainCommand {
             Preset::Paper => 0,
         };
         default.world.max_steps = episode_steps.unwrap_or(0);
-        simulate(self.simulation.check(&default)?, training)
+        simulate(self.simulation.check(default)?, training)
     }
 }
 
