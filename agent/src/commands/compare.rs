@@ -15,7 +15,6 @@ use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;
-
 use emberwatch_learning::config::AgentConfig;
 use emberwatch_learning::file::{Readers, replace_file};
 use emberwatch_learning::learned::Learned;
@@ -78,7 +77,6 @@ pub struct CompareCommand {
 }
 
 impl CompareCommand {
-    /// Runs the comparison and writes its results.
     pub fn run(&self) -> Result<()> {
         if asks_for_help(&self.policies) {
             return write(&policy::help());
@@ -97,20 +95,21 @@ impl CompareCommand {
         // Errors in settings and policies come before any run.
         let sources = numbers.into_iter().map(|number| self.worlds.source(number));
         let sources = sources.collect::<Result<Vec<Source>>>()?;
-        for source in &sources {
-            let has_teams = self.has_teams(source.task());
-            let checked = source
-                .model()
-                .map(|it| self.policies(it, &learned, has_teams));
-            checked.transpose()?;
+        let has_teams = self.has_teams(sources[0].task());
+        if let Some(model) = sources[0].model() {
+            self.policies(model, &learned, has_teams)?;
         }
         let mut report = Report::default();
         for source in sources {
             let (seeds, task) = (self.worlds.seeds(&source), source.task().cloned());
-            let has_teams = self.has_teams(task.as_ref());
             let arena = &mut source.open((seeds.end - seeds.start) as u32)?;
+            let mut policies = self.policies(&arena.model, &learned, has_teams)?;
+            if arena.lacks_model() && self.policies.is_empty() && !has_teams {
+                policies.retain(|policy| !policy.belief.knows_model);
+            }
+            report.baseline = self.baseline(arena, &policies, has_teams)?;
             let comparison = Comparison {
-                policies: self.policies_on(arena, &learned, has_teams)?,
+                policies,
                 teams: self.team.clone(),
                 seeds,
                 steps: self.worlds.steps(task.as_ref(), arena.info())?,
@@ -120,9 +119,6 @@ impl CompareCommand {
             };
             self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
-            let policies = &comparison.policies;
-            report.baseline =
-                self.baseline(&arena.model, arena.lacks_model(), policies, has_teams)?;
             report.axis_label = axis_label(&arena.model);
             report.fire_cells = results.fire_cells;
             report.runs.extend(results.runs);
@@ -200,22 +196,7 @@ impl CompareCommand {
         self.csv.as_deref().map_or(Ok(()), check_csv)
     }
 
-    /// Returns the policies to run in an arena. If the arena has no model, the ladder keeps only policies that need
-    /// none.
-    fn policies_on(
-        &self,
-        arena: &Arena,
-        learned: &Learned,
-        has_teams: bool,
-    ) -> Result<Vec<Policy>> {
-        let mut policies = self.policies(&arena.model, learned, has_teams)?;
-        if arena.lacks_model() && self.policies.is_empty() && !has_teams {
-            policies.retain(|policy| !policy.belief.knows_model);
-        }
-        Ok(policies)
-    }
-
-    /// Refuses policies that no server can run, before waiting for a server.
+    /// Refuses policies that no server can run, whatever its model is.
     fn check_names(&self) -> Result<()> {
         let mut policies = self.policies.iter().filter(|name| *name != OPTIONS);
         policies.try_for_each(|name| policy::check_name(name))?;
@@ -234,7 +215,7 @@ impl CompareCommand {
             }
         };
         let policies = match self.policies.as_slice() {
-            [] if has_teams => vec![named(&TEAM_POLICY.to_owned())?],
+            [] if has_teams => vec![Policy::named(TEAM_POLICY, model)?],
             [] => policy::ladder(model, learned),
             names => {
                 let policies = names.iter().map(with_options);
@@ -250,7 +231,6 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        self.baseline(model, false, &policies, has_teams)?;
         policies
             .iter()
             .try_for_each(|policy| policy.check(learned))?;
@@ -265,15 +245,10 @@ impl CompareCommand {
     }
 
     /// Returns the name of the baseline: `--baseline`, or the default for options, teams or the ladder.
-    fn baseline(
-        &self,
-        model: &Model,
-        lacks_model: bool,
-        policies: &[Policy],
-        has_teams: bool,
-    ) -> Result<String> {
+    fn baseline(&self, arena: &Arena, policies: &[Policy], has_teams: bool) -> Result<String> {
         if let Some(name) = &self.baseline {
-            return Ok(Policy::named(name, model).context("--baseline")?.name);
+            let policy = Policy::named(name, &arena.model);
+            return Ok(policy.context("--baseline")?.name);
         }
         let mut policies = policies.iter();
         let found = if self.policies.iter().any(|name| name == OPTIONS) {
@@ -281,7 +256,11 @@ impl CompareCommand {
         } else {
             policies.next().filter(|_| has_teams)
         };
-        let default = if lacks_model { "coverage" } else { "shooting" };
+        let default = if arena.lacks_model() {
+            "coverage"
+        } else {
+            "shooting"
+        };
         Ok(found.map_or(default, |policy| &policy.name).to_owned())
     }
 }
