@@ -31,6 +31,7 @@ dance => dance
 --worlds 1024 --height 4096 --width 4096 => memory: expected | MiB for 1024 worlds of 4096 x 4096 cells | got
 status --instance nobody => no server on instance "nobody"
 stop --instance nobody => no server on instance "nobody"
+stop --json => --json
 "#;
 
 /// Invalid flags of the agent, and words of the resulting error.
@@ -56,6 +57,7 @@ compare --seeds 8..0 => --seeds | FIRST below END
 compare --seeds 3 => --seeds | FIRST..END
 compare --steps 0 => --steps | 1..=10000000
 compare --robots 1,65 => --robots | expected 1 to 64
+train --out x --robots 1,2 => '1,2' | --robots | expected 1 to 64
 compare --team apart => --team | alone, shared, joint, oracle
 compare --policies coverage,coverage => each name once | got "coverage" twice
 compare --baseline ash => --baseline | expected one of | got "ash"
@@ -121,7 +123,7 @@ run SERVER => does not reveal its model | --model FILE",
         ),
         (
             "--reveal-model false --publish-truth",
-            "compare SERVER --policies coverage => comparing needs the model | --reveal-model true",
+            "compare SERVER --policies coverage => instance | comparing needs the model | --reveal-model true",
         ),
         (
             "--publish-truth",

@@ -1,9 +1,9 @@
 //! Flags for the agent's settings. Each flag overrides the preset or the configuration file.
 
 use anyhow::{Context, Result, bail};
-use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueEnum};
-use emberwatch_acting::config::{AgentConfig, PriorKind};
+use emberwatch_acting::config::AgentConfig;
 use emberwatch_learning::learners;
 use emberwatch_learning::learners::decisions::belief_of;
 use emberwatch_protocol::program::read_text;
@@ -33,33 +33,13 @@ pub struct AgentFlags {
     /// Number of random paths that the shooting planner samples
     #[arg(long)]
     pub shooting_samples: Option<usize>,
-    /// First belief of the known-model filter
-    #[arg(long, value_parser = one_of(&PriorKind::ALL))]
-    pub prior: Option<PriorKind>,
+    /// First belief of the known-model filter: simulated (frequencies of each cell's states in simulated worlds after
+    /// the server's burn-in), initial (the model's initial distribution) or uniform
+    #[arg(long, value_parser = PossibleValuesParser::new(["simulated", "initial", "uniform"]))]
+    pub prior: Option<String>,
     /// Seed of planners, of learners, and of the worlds that the first belief is simulated from [default: 0]
     #[arg(long)]
     pub agent_seed: Option<u64>,
-}
-
-/// Returns a parser for a flag with these values. Each value has a name and an explanation for `--help`.
-pub fn one_of<T: Copy + Send + Sync + 'static>(
-    all: &'static [(T, &str, &str)],
-) -> impl TypedValueParser<Value = T> {
-    let names = all
-        .iter()
-        .map(|(_, name, help)| PossibleValue::new(*name).help(*help));
-    PossibleValuesParser::new(names).map(|name| {
-        let found = all.iter().find(|(_, known, _)| *known == name);
-        found.expect("invariant: only these names are accepted").0
-    })
-}
-
-/// Like [`one_of`], for flags whose value is the name itself.
-pub fn one_of_names(
-    all: impl Iterator<Item = (&'static str, &'static str)>,
-) -> PossibleValuesParser {
-    let names = all.map(|(name, help)| PossibleValue::new(name).help(help));
-    PossibleValuesParser::new(names)
 }
 
 impl AgentFlags {
@@ -75,7 +55,9 @@ impl AgentFlags {
         };
         config.beam_width = self.beam_width.unwrap_or(config.beam_width);
         config.shooting_samples = self.shooting_samples.unwrap_or(config.shooting_samples);
-        config.prior = self.prior.unwrap_or(config.prior);
+        if let Some(prior) = &self.prior {
+            config.prior = serde_json::from_value(prior.as_str().into())?;
+        }
         config.seed = self.agent_seed.unwrap_or(config.seed);
         config.check()?;
         learners::named(&config.learner).map_err(anyhow::Error::msg)?;

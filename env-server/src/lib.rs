@@ -5,6 +5,5 @@
 
 #![allow(missing_docs, reason = "a program; only its tests use the library")]
 
-pub mod flags;
 pub mod recording;
 pub mod server;

@@ -4,9 +4,10 @@ mod commands;
 
 use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
-use emberwatch_protocol::program::{parse_flags, print, start_logging, stop_on_signals};
-use emberwatch_server::flags::ServerFlags;
-use emberwatch_server::server::{serve, warn};
+use emberwatch_protocol::program::{Flags, parse_flags, print, start_logging, stop_on_signals};
+use emberwatch_server::server::{announce_settings, serve};
+use emberwatch_sim::config::ServerConfig;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 /// Simulates worlds and serves them to agents over shared memory.
@@ -19,8 +20,11 @@ use std::process::ExitCode;
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
+    /// Read settings from this TOML file, which flags override
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
     #[command(flatten)]
-    flags: ServerFlags,
+    settings: Flags<ServerConfig>,
     /// Check the settings, print the effective ones as TOML, and exit
     #[arg(long)]
     check: bool,
@@ -66,9 +70,11 @@ fn run(cli: &Cli) -> Result<()> {
         Some(Command::Fork(command)) => command.run(),
         Some(Command::Record(command)) => command.run(),
         None => {
-            let checked = cli.flags.effective()?.check()?;
+            let config = cli.config.as_deref().map(ServerConfig::read);
+            let config = config.transpose()?.unwrap_or_default();
+            let checked = config.with(cli.settings.given())?.check()?;
             if cli.check {
-                warn(&checked);
+                announce_settings(&checked);
                 return Ok(print(&toml::to_string(&checked.config)?)?);
             }
             let stop = stop_on_signals().context("handle signals")?;

@@ -17,4 +17,4 @@ mod taken;
 
 pub use ports::Ports;
 pub use serve::serve;
-pub use state::warn;
+pub use state::announce_settings;

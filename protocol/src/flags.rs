@@ -13,7 +13,8 @@ pub struct Flags<S> {
 }
 
 impl<S> Flags<S> {
-    /// Returns the values that were given, by the names of their settings.
+    /// Returns the values that were given, by the names of their settings. Flags that take several values separated by
+    /// commas have a list of them.
     pub fn given(&self) -> &Map<String, Value> {
         &self.given
     }
@@ -31,8 +32,14 @@ impl<S: Settings> FromArgMatches for Flags<S> {
 
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), Error> {
         for Setting { name, .. } in S::settings() {
-            let value = matches.get_one::<Value>(name).cloned();
-            self.given.extend(value.map(|value| (name.into(), value)));
+            let values = matches.get_many::<Value>(name).into_iter().flatten();
+            let mut values: Vec<Value> = values.cloned().collect();
+            let value = match values.len() {
+                0 => continue,
+                1 => values.remove(0),
+                _ => Value::Array(values),
+            };
+            self.given.insert(name.into(), value);
         }
         Ok(())
     }

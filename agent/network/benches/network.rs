@@ -10,8 +10,8 @@ use emberwatch_model::grid::Shape;
 use emberwatch_model::path::{Move, fly};
 use emberwatch_model::randomness::split_mix;
 use emberwatch_network::{
-    Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, DqnShape, Lesson, NetworkShape,
-    NeuralBelief, Sightings, Transition, Window,
+    AdamSettings, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, DqnShape, Lesson,
+    NetworkShape, NeuralBelief, Sightings, Transition, Window,
 };
 
 #[path = "../../src/process.rs"]
@@ -50,7 +50,12 @@ fn full_frame(step: u64) -> Frame {
 }
 
 fn network() -> Autoencoder {
-    let settings = AutoencoderSettings::paper_large();
+    let settings = AutoencoderSettings {
+        encoding: 16,
+        hidden: 16,
+        adam: AdamSettings::paper(1e-3),
+        ..AutoencoderSettings::paper()
+    };
     let shape = NetworkShape {
         grid: shape(),
         n_states: 3,

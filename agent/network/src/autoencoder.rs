@@ -46,16 +46,6 @@ impl AutoencoderSettings {
             adam: AdamSettings::paper(1e-4),
         }
     }
-
-    /// Returns the settings of the authors' larger network, with the larger of their learning rates.
-    pub fn paper_large() -> Self {
-        Self {
-            encoding: 16,
-            hidden: 16,
-            adam: AdamSettings::paper(1e-3),
-            ..Self::paper()
-        }
-    }
 }
 
 /// The network, its variables and its optimiser. Clones share the variables, so an update of one clone changes all.
@@ -236,18 +226,6 @@ impl Autoencoder {
         self.adam.set_steps(steps);
         self.n_updates = n_updates;
         Ok(())
-    }
-
-    /// Loads only the parameters and statistics, for example from a network trained with PyTorch.
-    ///
-    /// # Errors
-    /// If `find` or the device fails. The network is then unchanged.
-    pub fn load_variables<E: From<NetworkError>>(
-        &mut self,
-        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
-    ) -> Result<(), E> {
-        let changes = found(&[("", self.variables())], find)?;
-        Ok(set(&changes).map_err(NetworkError::from)?)
     }
 }
 

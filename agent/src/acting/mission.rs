@@ -14,6 +14,8 @@ use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::model::{Description, ModelError};
 use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 #[derive(Debug, Clone)]
@@ -36,9 +38,15 @@ pub struct Mission {
     pub config: AgentConfig,
     /// Learned models, for policies that use them.
     pub learned: Learned,
+    /// Set when the agent must stop.
+    pub stop: Arc<AtomicBool>,
 }
 
 impl Mission {
+    pub fn is_over(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
     pub(super) fn worlds(&self) -> Range<u32> {
         self.world..self.world.saturating_add(1)
     }

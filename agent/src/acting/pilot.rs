@@ -21,7 +21,6 @@ use emberwatch_protocol::control::{ServerInfo, WorldSeed};
 use emberwatch_protocol::feed::Feed;
 use emberwatch_protocol::{Cell, Client, Model, Move};
 use std::ops::Range;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 /// Minimum time between two warnings about missed steps.
@@ -124,7 +123,7 @@ impl Pilot {
             _ => numbers.clone(),
         };
         let sees_truth = policy.belief.input == Input::States;
-        let mut link = Link::new(client, &mission.instance, robots.clone(), sees_truth)?;
+        let mut link = Link::new(client, mission, robots.clone(), sees_truth)?;
         let seen = link.observe()?;
         let (seed, step) = (seen.observation.world.seed, seen.observation.world.step);
         tracing::info!(
@@ -185,19 +184,14 @@ impl Pilot {
     }
 
     /// Flies one step, in the next episode if the last one has ended. Returns the reward. Returns `None` if no path was
-    /// flown, either because `stop` was set, or because the world stepped without the agent, which then catches up.
+    /// flown, either because the agent must stop, or because the world stepped without the agent, which then catches up.
     /// The belief after the last step is always published.
-    pub fn step(
-        &mut self,
-        mission: &Mission,
-        is_last: bool,
-        stop: &AtomicBool,
-    ) -> Result<Option<f64>> {
+    pub fn step(&mut self, mission: &Mission, is_last: bool) -> Result<Option<f64>> {
         if self.flyer.rollout.observation().world.truncated != 0 {
             self.begin_next(mission)?;
         }
         self.flyer.is_last = is_last;
-        match rollout::step(&mut self.flyer, &mut self.link.until(stop)) {
+        match rollout::step(&mut self.flyer, &mut self.link) {
             Ok(flown) => Ok(flown.map(|_| self.flyer.reward())),
             Err(error) if is_late(&error) => self.catch_up().map(|()| None),
             Err(error) => Err(error),

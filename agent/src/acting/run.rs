@@ -6,7 +6,6 @@ use crate::client::errors::{is_outage, refusal};
 use crate::client::info::RETRY_INTERVAL;
 use anyhow::Result;
 use emberwatch_protocol::message::Status;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 const REPORT_INTERVAL: Duration = Duration::from_secs(2);
@@ -19,9 +18,9 @@ pub struct Summary {
     pub reward: f64,
 }
 
-/// Acts in successive episodes until the mission's steps are done or `stop` is set. If the server stops, waits for a
+/// Acts in successive episodes until the mission's steps are done or it must stop. If the server stops, waits for a
 /// new server.
-pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
+pub fn run(mission: &Mission) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut pilot = Pilot::attach(mission)?;
     let mut report = Report {
@@ -29,10 +28,10 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
         last: summary,
     };
     let mut due = Instant::now();
-    while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
+    while !mission.is_over() && (mission.steps == 0 || summary.steps < mission.steps) {
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
         due = Instant::now() + mission.shortest_step;
-        match pilot.step(mission, summary.steps + 1 == mission.steps, stop) {
+        match pilot.step(mission, summary.steps + 1 == mission.steps) {
             Ok(Some(reward)) => {
                 summary.steps += 1;
                 summary.reward += reward;
@@ -41,7 +40,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
             Ok(None) => {}
             Err(error) if is_outage(&error) => {
                 tracing::warn!("{error}; waiting for the server to come back");
-                match attach_again(mission, stop)? {
+                match attach_again(mission)? {
                     Some(again) => pilot = again,
                     None => {
                         is_in_step = false;
@@ -86,11 +85,11 @@ impl Report {
     }
 }
 
-/// Waits for the server to come back, and attaches again. Returns `None` if `stop` is set first.
-fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Pilot>> {
+/// Waits for the server to come back, and attaches again. Returns `None` if the agent must stop first.
+fn attach_again(mission: &Mission) -> Result<Option<Pilot>> {
     let mut mission = mission.clone();
     mission.takeover = false;
-    while !stop.load(Ordering::Relaxed) {
+    while !mission.is_over() {
         match Pilot::attach(&mission) {
             Ok(pilot) => return Ok(Some(pilot)),
             // The server had only paused, so this process's former connection still holds the robots.

@@ -14,7 +14,7 @@ pub enum Team {
     Shared,
     /// One agent plans for all robots, on one belief
     Joint,
-    /// One agent plans for all robots on the true states, whatever --policies says
+    /// One agent plans for all robots on the true states, whatever --policies says; only in comparisons
     Oracle,
 }
 

@@ -89,7 +89,6 @@ impl Arena {
         self.info().recorded_world.is_some() && self.known.is_none()
     }
 
-    /// Returns whether hidden states can be read.
     pub fn has_truth(&mut self) -> bool {
         self.client.backend().has_truth()
     }

@@ -19,7 +19,6 @@ use emberwatch_acting::rollout::{
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Plan;
 use emberwatch_belief::planning::team::robot_seed;
-use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::feed::Feed;
 use emberwatch_protocol::{Model, Move};
 use std::ops::Range;
@@ -95,9 +94,8 @@ pub fn compare(
 
 impl Comparison {
     /// Returns the worlds that each policy's rows have, in ascending order.
-    pub fn worlds(&self, info: &ServerInfo) -> Vec<World> {
-        let fingerprint = info.worlds_fingerprint.clone().unwrap_or_default();
-        let world = |seed| (seed, self.steps, fingerprint.clone());
+    pub fn worlds(&self, fingerprint: &str) -> Vec<World> {
+        let world = |seed| (seed, self.steps, fingerprint.to_owned());
         self.seeds.clone().map(world).collect()
     }
 

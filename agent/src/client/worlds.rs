@@ -45,13 +45,14 @@ impl Worlds {
         })
     }
 
-    /// Simulates worlds in this process, and starts their burn-ins. Logs warnings about the settings.
+    /// Simulates worlds in this process, and starts their burn-ins. Warns of settings that do badly.
     ///
     /// # Errors
     /// If there is too little memory, or no threads can be started.
     pub fn simulate(settings: Checked) -> Result<Self> {
-        let warnings = settings.warnings();
-        warnings.iter().for_each(|words| tracing::warn!("{words}"));
+        for warning in settings.warnings() {
+            tracing::warn!("{warning}");
+        }
         Ok(Self::Simulated(Box::new(Embedded::new(settings)?)))
     }
 

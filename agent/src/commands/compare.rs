@@ -14,7 +14,6 @@ use crate::benchmark::report::{
 use crate::flags::AgentFlags;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
-
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
 use emberwatch_acting::policy::{self, Goal, LearnedDecisions, Policy};
@@ -77,7 +76,6 @@ pub struct CompareCommand {
 }
 
 impl CompareCommand {
-    /// Runs the comparison and writes its results.
     pub fn run(&self) -> Result<()> {
         if asks_for_help(&self.policies) {
             return write(&policy::help());
@@ -87,7 +85,8 @@ impl CompareCommand {
         self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = learners::read(checkpoints, &self.device.open()?)?;
-        let numbers: Vec<Option<u32>> = match self.robots() {
+        let robots = self.worlds.robots();
+        let numbers: Vec<Option<u32>> = match robots.as_slice() {
             [] => vec![None],
             robots => robots.iter().copied().map(Some).collect(),
         };
@@ -95,20 +94,21 @@ impl CompareCommand {
         // Errors in settings and policies come before any run.
         let sources = numbers.into_iter().map(|number| self.worlds.source(number));
         let sources = sources.collect::<Result<Vec<Source>>>()?;
-        for source in &sources {
-            let has_teams = self.has_teams(source.task());
-            let checked = source
-                .model()
-                .map(|it| self.policies(it, &learned, has_teams));
-            checked.transpose()?;
+        let has_teams = self.has_teams(sources[0].task());
+        if let Some(model) = sources[0].model() {
+            self.policies(model, &learned, has_teams)?;
         }
         let mut report = Report::default();
         for source in sources {
             let (seeds, task) = (self.worlds.seeds(&source), source.task().cloned());
-            let has_teams = self.has_teams(task.as_ref());
             let arena = &mut source.open((seeds.end - seeds.start) as u32)?;
+            let mut policies = self.policies(&arena.model, &learned, has_teams)?;
+            if arena.lacks_model() && self.policies.is_empty() && !has_teams {
+                policies.retain(|policy| !policy.belief.knows_model);
+            }
+            report.baseline = self.baseline(arena, &policies, has_teams)?;
             let comparison = Comparison {
-                policies: self.policies_on(arena, &learned, has_teams)?,
+                policies,
                 teams: self.team.clone(),
                 seeds,
                 steps: self.worlds.steps(task.as_ref(), arena.info())?,
@@ -118,9 +118,6 @@ impl CompareCommand {
             };
             self.check_added(&added, &comparison, arena.info())?;
             let results = run_comparison(arena, &comparison)?;
-            let policies = &comparison.policies;
-            report.baseline =
-                self.baseline(&arena.model, arena.lacks_model(), policies, has_teams)?;
             report.axis_label = axis_label(&arena.model);
             report.fire_cells = results.fire_cells;
             report.runs.extend(results.runs);
@@ -168,10 +165,11 @@ impl CompareCommand {
         comparison: &Comparison,
         info: &ServerInfo,
     ) -> Result<()> {
-        let robots = info.n_robots;
-        let is_here =
-            |run: &&PolicyRun| run.robots == robots || !self.robots().contains(&run.robots);
+        let (robots, all) = (info.n_robots, self.worlds.robots());
+        let is_here = |run: &&PolicyRun| run.robots == robots || !all.contains(&run.robots);
         let added: Vec<PolicyRun> = added.iter().filter(is_here).cloned().collect();
+        let fingerprint = info.worlds_fingerprint.as_deref().unwrap_or_default();
+        let worlds = comparison.worlds(fingerprint);
         for group in groups(&added) {
             let policy = group.policy;
             let mut own = comparison.policies.iter();
@@ -179,8 +177,7 @@ impl CompareCommand {
                 own.all(|own| own.name != policy),
                 "--add: policy {policy:?}: expected a name that no compared policy has"
             );
-            check_worlds(policy, group.runs.iter().copied(), &comparison.worlds(info))
-                .context("--add")?;
+            check_worlds(policy, group.runs.iter().copied(), &worlds).context("--add")?;
         }
         Ok(())
     }
@@ -191,22 +188,7 @@ impl CompareCommand {
         self.csv.as_deref().map_or(Ok(()), check_csv)
     }
 
-    /// Returns the policies to run in an arena. If the arena has no model, the ladder keeps only policies that need
-    /// none.
-    fn policies_on(
-        &self,
-        arena: &Arena,
-        learned: &Learned,
-        has_teams: bool,
-    ) -> Result<Vec<Policy>> {
-        let mut policies = self.policies(&arena.model, learned, has_teams)?;
-        if arena.lacks_model() && self.policies.is_empty() && !has_teams {
-            policies.retain(|policy| !policy.belief.knows_model);
-        }
-        Ok(policies)
-    }
-
-    /// Refuses policies that no server can run, before waiting for a server.
+    /// Refuses policies that no server can run, whatever its model is.
     fn check_names(&self) -> Result<()> {
         let mut policies = self.policies.iter().filter(|name| *name != OPTIONS);
         policies.try_for_each(|name| policy::check_name(name))?;
@@ -225,7 +207,7 @@ impl CompareCommand {
             }
         };
         let policies = match self.policies.as_slice() {
-            [] if has_teams => vec![named(&TEAM_POLICY.to_owned())?],
+            [] if has_teams => vec![Policy::named(TEAM_POLICY, model)?],
             [] => policy::ladder(model, learned),
             names => {
                 let policies = names.iter().map(with_options);
@@ -241,35 +223,24 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        self.baseline(model, false, &policies, has_teams)?;
         policies
             .iter()
             .try_for_each(|policy| policy.check(learned))?;
         Ok(policies)
     }
 
-    /// Returns the given numbers of robots per world.
-    fn robots(&self) -> &[u32] {
-        &self.worlds.simulation.robots
-    }
-
     /// Returns whether worlds have several robots, or `--team` names other kinds than `alone`.
     fn has_teams(&self, task: Option<&Task>) -> bool {
         let of_task = task.map(|task| task.world.robots);
-        let mut robots = self.robots().iter().copied().chain(of_task);
+        let mut robots = self.worlds.robots().into_iter().chain(of_task);
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 
     /// Returns the name of the baseline: `--baseline`, or the default for options, teams or the ladder.
-    fn baseline(
-        &self,
-        model: &Model,
-        lacks_model: bool,
-        policies: &[Policy],
-        has_teams: bool,
-    ) -> Result<String> {
+    fn baseline(&self, arena: &Arena, policies: &[Policy], has_teams: bool) -> Result<String> {
         if let Some(name) = &self.baseline {
-            return Ok(Policy::named(name, model).context("--baseline")?.name);
+            let policy = Policy::named(name, &arena.model);
+            return Ok(policy.context("--baseline")?.name);
         }
         let mut policies = policies.iter();
         let found = if self.policies.iter().any(|name| name == OPTIONS) {
@@ -277,7 +248,11 @@ impl CompareCommand {
         } else {
             policies.next().filter(|_| has_teams)
         };
-        let default = if lacks_model { "coverage" } else { "shooting" };
+        let default = if arena.lacks_model() {
+            "coverage"
+        } else {
+            "shooting"
+        };
         Ok(found.map_or(default, |policy| &policy.name).to_owned())
     }
 }

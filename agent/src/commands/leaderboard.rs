@@ -32,7 +32,6 @@ pub struct LeaderboardCommand {
 }
 
 impl LeaderboardCommand {
-    /// Adds the entry of `--add`, if given, and rebuilds the page.
     pub fn run(&self) -> Result<()> {
         if let Some(folder) = &self.add {
             self.add(folder)?;

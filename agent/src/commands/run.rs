@@ -18,7 +18,6 @@ use emberwatch_protocol::program::stop_on_signals;
 use emberwatch_sim::config::model_named;
 use std::ops::Range;
 use std::path::PathBuf;
-use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 /// Act on one world of a running server.
@@ -90,12 +89,12 @@ impl RunCommand {
             model,
             config: self.settings.effective()?,
             learned: learners::read(self.checkpoint.as_deref(), &self.device.open()?)?,
+            stop: stop_on_signals().context("handle signals")?,
         };
-        let stop = stop_on_signals().context("handle signals")?;
-        if !wait_for_server(&mission.instance, self.wait, || stop.load(Relaxed))? {
+        if !wait_for_server(&mission.instance, self.wait, || mission.is_over())? {
             return Ok(());
         }
-        let summary = run(&mission, &stop)?;
+        let summary = run(&mission)?;
         let mean_reward = summary.reward / summary.steps.max(1) as f64;
         tracing::info!(steps = summary.steps, mean_reward, "done");
         Ok(())

@@ -22,7 +22,7 @@ use emberwatch_acting::learned::Learned;
 use emberwatch_acting::policy::{self, Policy};
 use emberwatch_protocol::task::Task;
 use emberwatch_sim::config::{Checked, ServerConfig};
-use std::ops::Range;
+use emberwatch_sim::snapshot::Settings;
 use std::path::PathBuf;
 
 /// Run policies on the test worlds of tasks, with one score per policy.
@@ -59,7 +59,6 @@ pub struct SuiteCommand {
 }
 
 impl SuiteCommand {
-    /// Performs the missing trainings and all runs, and writes the scores of all policies.
     pub fn run(&self) -> Result<()> {
         if asks_for_help(&self.policies) {
             return write(&policy::help());
@@ -101,17 +100,17 @@ impl SuiteCommand {
         if let Some(n) = self.worlds {
             seeds.end = seeds.end.min(seeds.start.saturating_add(n));
         }
-        let arena = open(settings.clone(), &seeds, 1)?;
-        let longest = arena.info().shortest_episode().unwrap_or(u64::MAX);
-        ensure!(
-            task.world.max_steps <= longest,
-            "max_steps: expected at most {longest}, the length of the shortest episode, got {}",
-            task.world.max_steps
-        );
+        if let Some(states) = &settings.recorded {
+            let (longest, got) = (states.recorded.n_steps(), task.world.max_steps);
+            ensure!(
+                got <= longest,
+                "max_steps: expected at most {longest}, the length of the shortest episode, got {got}"
+            );
+        }
         let mut policies: Vec<Policy> = Vec::new();
         let names = self.policies.iter().map(|name| &**name);
         for name in [FLOOR, CEILING].into_iter().chain(names) {
-            let policy = Policy::named(name, &arena.model)?;
+            let policy = Policy::named(name, &settings.model)?;
             if !policies.contains(&policy) {
                 policies.push(policy);
             }
@@ -136,9 +135,9 @@ impl SuiteCommand {
         let mut others = csv_files(&folder)?;
         others.retain(|file| !own.contains(file));
         Ok(Plan {
-            worlds: comparison.worlds(arena.info()),
+            worlds: comparison.worlds(&Settings::of(&settings).worlds_fingerprint()),
             comparison,
-            form: WorldForm::of(&arena.model, arena.shape()),
+            form: WorldForm::of(&settings.model, settings.shape),
             others: read_tasks(others)?,
             settings,
             folder,
@@ -149,7 +148,6 @@ impl SuiteCommand {
     /// the folder. Warns about policies that cannot run or were measured on other worlds, and leaves them out.
     fn carry_out(&self, plan: &Plan) -> Result<Vec<PolicyRun>> {
         let task = &plan.task().name;
-        let mut runs = plan.comparable();
         let mut ready = Vec::new();
         for policy in &plan.comparison.policies {
             match self.prepare(plan, policy) {
@@ -159,12 +157,9 @@ impl SuiteCommand {
                 }
             }
         }
-        if ready.is_empty() {
-            return Ok(runs);
-        }
-        // Opened after all trainings, because an unused lease ends.
-        let n_worlds = plan.worlds.len() as u32;
-        let mut arena = open(plan.settings.clone(), &plan.comparison.seeds, n_worlds)?;
+        let mut runs = plan.comparable();
+        // Opened after all trainings, because a lease that is not used for long ends.
+        let mut arena = plan.open()?;
         for (policy, trained) in ready {
             let comparison = Comparison {
                 policies: vec![policy.clone()],
@@ -204,13 +199,6 @@ impl SuiteCommand {
     }
 }
 
-/// Simulates worlds of a task, and acquires them.
-fn open(mut settings: Checked, seeds: &Range<u64>, n_worlds: u32) -> Result<Arena> {
-    settings.config.seed = seeds.start;
-    let settings = settings.with_worlds(n_worlds.min(MAX_BATCH))?;
-    Arena::open(Worlds::simulate(settings)?, n_worlds)
-}
-
 /// The policies and worlds of one task of a suite, and the rows of other policies in its folder.
 struct Plan {
     /// Settings of the task's worlds.
@@ -227,6 +215,15 @@ impl Plan {
     fn task(&self) -> &Task {
         let task = self.settings.task.as_ref();
         task.expect("invariant: a suite's settings have a task")
+    }
+
+    /// Simulates the worlds, and acquires them.
+    fn open(&self) -> Result<Arena> {
+        let n_worlds = self.worlds.len() as u32;
+        let mut settings = self.settings.clone();
+        settings.config.seed = self.comparison.seeds.start;
+        let settings = settings.with_worlds(n_worlds.min(MAX_BATCH))?;
+        Arena::open(Worlds::simulate(settings)?, n_worlds)
     }
 
     /// Returns the rows of other policies that are from this suite's worlds.

@@ -4,10 +4,11 @@ use super::shared::{make_folder, parse_seconds};
 use super::worlds::{BURN_IN, SimulationFlags};
 use crate::benchmark::report::training::draw_training;
 use crate::client::worlds::Worlds;
-use crate::flags::{AgentFlags, Preset, one_of, one_of_names};
+use crate::flags::{AgentFlags, Preset};
 use crate::training::{CHECKPOINT, TrainingSpec, train};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser};
 use emberwatch_acting::beliefs::{self, BeliefKind};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
@@ -30,21 +31,11 @@ use std::time::{Duration, Instant};
 /// Default number of training worlds, except for a learner that follows a single world.
 pub(super) const N_WORLDS: u32 = 16;
 
-/// The values of `--coverage`. Each consists of whether frames show every cell, the value's name, and its help text.
-const COVERAGES: [(bool, &str, &str); 2] = [
-    (false, "path", "The cells in sight of the path"),
-    (
-        true,
-        "full",
-        "Every cell, if the server's coverage is `client` or `full`",
-    ),
-];
-
 /// Learn a model while acting.
 #[derive(Args)]
 pub struct TrainCommand {
     /// What to learn [default: filter; with --preset paper: autoencoder]
-    #[arg(long, value_parser = one_of_names(LEARNERS.iter().map(|kind| (kind.name, kind.about))))]
+    #[arg(long, value_parser = PossibleValuesParser::new(LEARNERS.iter().map(|kind| PossibleValue::new(kind.name).help(kind.about))))]
     learner: Option<String>,
     /// Folder for checkpoint.safetensors, metrics.csv and training.svg, with a subfolder for an estimator trained first
     #[arg(long, value_name = "DIR")]
@@ -66,9 +57,10 @@ pub struct TrainCommand {
     /// Maximum seconds to act, including the training of an estimator
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
-    /// Cells that frames show to a filter in training [default: from the settings; with --resume: the checkpoint's]
-    #[arg(long = "coverage", value_name = "CELLS", value_parser = one_of(&COVERAGES))]
-    full_frames: Option<bool>,
+    /// Cells that frames show to a filter in training: path (those in sight of the path) or full (every cell, if the
+    /// server's coverage is `client` or `full`) [default: from the settings; with --resume: the checkpoint's]
+    #[arg(long, value_name = "CELLS", value_parser = ["path", "full"])]
+    coverage: Option<String>,
     /// Device for an autoencoder or a neural belief: cpu, cuda or metal
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceKind,
@@ -128,8 +120,8 @@ impl TrainCommand {
         }
         let kind = learners::named(&config.learner).map_err(anyhow::Error::msg)?;
         self.check_flags(kind)?;
-        if let Some(full_frames) = self.full_frames {
-            config.full_frames = full_frames;
+        if let Some(coverage) = &self.coverage {
+            config.full_frames = coverage == "full";
         }
         let n_worlds = self
             .worlds
@@ -160,7 +152,7 @@ impl TrainCommand {
     /// Refuses flags that the learner would ignore.
     fn check_flags(&self, kind: &LearnerKind) -> Result<()> {
         for (flag, is_given) in [
-            ("coverage", self.full_frames.is_some()),
+            ("coverage", self.coverage.is_some()),
             ("estimator", self.estimator.is_some()),
             ("checkpoint", self.checkpoint.is_some()),
         ] {
@@ -226,11 +218,10 @@ impl TrainCommand {
 
     /// Refuses flags that differ from the settings of the checkpoint to resume.
     fn check_adopted(&self, adopted: &AgentConfig) -> Result<()> {
-        let coverage = |full_frames: bool| COVERAGES[usize::from(full_frames)].1;
+        let coverage = if adopted.full_frames { "full" } else { "path" };
         let estimator = self.estimator.map(|kind| kind.name);
-        let given = self.full_frames.map(coverage);
         for (flag, got, expected) in [
-            ("coverage", given, coverage(adopted.full_frames)),
+            ("coverage", self.coverage.as_deref(), coverage),
             ("estimator", estimator, &adopted.decisions.estimator),
         ] {
             ensure!(
@@ -268,11 +259,6 @@ impl TrainCommand {
 
     /// Attaches to the server, or starts to simulate worlds.
     fn worlds(&self, training: &TrainingSpec) -> Result<Worlds> {
-        let n_numbers = self.simulation.robots.len();
-        ensure!(
-            n_numbers <= 1,
-            "--robots: expected one number of robots per world, got {n_numbers}"
-        );
         let episode_steps = (training.learner()?.episode_steps)(&training.config);
         if let Some(name) = &self.instance {
             let worlds = Worlds::attach(&Instance::new(name)?, false)?;
@@ -298,7 +284,7 @@ impl TrainCommand {
             Preset::Paper => 0,
         };
         default.world.max_steps = episode_steps.unwrap_or(0);
-        simulate(self.simulation.check(&default)?, training)
+        simulate(self.simulation.check(default)?, training)
     }
 }
 

@@ -3,8 +3,8 @@
 use super::shared::parse_range;
 use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::client::worlds::Worlds;
-use anyhow::{Result, ensure};
-use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, Id, value_parser};
+use anyhow::{Context, Result, ensure};
+use clap::{Args, value_parser};
 use emberwatch_protocol::Model;
 use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
@@ -23,8 +23,9 @@ const BENCHMARK_STEPS: u64 = 1500;
 
 const BENCHMARK_SEEDS: Range<u64> = 0..8;
 
-/// Flags that choose the worlds of a comparison.
+/// Flags that choose the worlds of a comparison, which may have several numbers of robots.
 #[derive(Debug, Args)]
+#[command(mut_arg("robots", |flag| flag.value_delimiter(',')))]
 pub struct WorldFlags {
     /// Use the worlds of this running server, instead of simulating worlds
     #[arg(long, conflicts_with = "settings")]
@@ -36,16 +37,19 @@ pub struct WorldFlags {
     #[arg(long, value_parser = value_parser!(u64).range(1..=10_000_000))]
     steps: Option<u64>,
     #[command(flatten)]
-    pub simulation: SimulationFlags,
+    simulation: SimulationFlags,
 }
 
 /// Settings of simulated worlds.
-#[derive(Debug, Clone)]
+#[derive(Debug, Args)]
+#[command(mut_arg("burn_in", |flag| flag.help(
+    "Number of steps simulated before k = 0 [default: 25000; `train --preset paper`: 0]")))]
 pub struct SimulationFlags {
+    #[arg(long, value_name = "NAME|FILE", group = "settings", help = format!(
+        "Task, which decides all of these settings: {}, or a path", listed(Task::built_in_names())))]
     task: Option<String>,
-    worlds: Map<String, Value>,
-    /// Numbers of robots per world.
-    pub robots: Vec<u32>,
+    #[command(flatten)]
+    settings: Flags<WorldSettings>,
 }
 
 /// Worlds that are not open yet.
@@ -55,84 +59,41 @@ pub enum Source {
     Settings(Box<Checked>, Option<Box<Model>>),
 }
 
-impl Args for SimulationFlags {
-    fn group_id() -> Option<Id> {
-        Flags::<WorldSettings>::group_id()
-    }
-
-    fn augment_args(command: Command) -> Command {
-        let task = Arg::new("task").long("task").value_name("NAME|FILE");
-        let names = listed(Task::built_in_names());
-        let task = task.help(format!(
-            "Task, which decides all of these settings: {names}, or a path"
-        ));
-        let burn_in =
-            "Number of steps simulated before k = 0 [default: 25000; `train --preset paper`: 0]";
-        Flags::<WorldSettings>::augment_args(command.arg(task))
-            .mut_group("settings", |group| group.arg("task"))
-            .mut_arg("burn_in", |flag| flag.help(burn_in))
-            .mut_arg("robots", |flag| flag.value_delimiter(','))
-    }
-
-    fn augment_args_for_update(command: Command) -> Command {
-        Self::augment_args(command)
-    }
-}
-
-impl FromArgMatches for SimulationFlags {
-    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        let robots = matches.get_many::<Value>("robots").into_iter().flatten();
-        let number = |robots: &Value| robots.as_u64().unwrap_or_default() as u32;
-        Ok(Self {
-            task: matches.get_one::<String>("task").cloned(),
-            worlds: Flags::<WorldSettings>::from_arg_matches(matches)?
-                .given()
-                .clone(),
-            robots: robots.map(number).collect(),
-        })
-    }
-
-    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
-        *self = Self::from_arg_matches(matches)?;
-        Ok(())
-    }
-}
-
 impl SimulationFlags {
     /// Returns checked settings of worlds to simulate. `default`: the settings without flags.
     ///
     /// # Errors
     /// If a setting is invalid, or a task or recorded states already decide it.
-    pub fn check(&self, default: &ServerConfig) -> Result<Checked, ConfigError> {
+    pub fn check(&self, default: ServerConfig) -> Result<Checked, ConfigError> {
+        check(&self.given(), default)
+    }
+
+    fn given(&self) -> Map<String, Value> {
         let task = self
             .task
             .iter()
             .map(|task| ("task".into(), task.as_str().into()));
-        let given = self.worlds.clone().into_iter().chain(task).collect();
-        default.with(&given)?.check()
-    }
-
-    /// Separates the model of beliefs about recorded states from the settings of the worlds.
-    fn separate(&self) -> Result<(Self, Option<Model>)> {
-        let mut flags = self.clone();
-        let states = flags.worlds.get("states").and_then(Value::as_str);
-        if states.is_none_or(str::is_empty) {
-            return Ok((flags, None));
-        }
-        let name = flags.worlds.remove("model");
-        let model = name.as_ref().and_then(Value::as_str).map(model_named);
-        let Some(model) = model.transpose()? else {
-            return Ok((flags, None));
-        };
-        let radius = flags.worlds.get("sensor_radius").and_then(Value::as_u64);
-        let model = radius.map_or(Ok(model.clone()), |radius| {
-            model.with_radius(radius as usize)
-        });
-        Ok((flags, Some(model?)))
+        self.settings
+            .given()
+            .clone()
+            .into_iter()
+            .chain(task)
+            .collect()
     }
 }
 
 impl WorldFlags {
+    /// Returns the numbers of robots per world; none if the flag was not given.
+    pub fn robots(&self) -> Vec<u32> {
+        let numbers = match self.simulation.settings.given().get("robots") {
+            None => &[],
+            Some(Value::Array(several)) => several.as_slice(),
+            Some(one) => std::slice::from_ref(one),
+        };
+        let numbers = numbers.iter().filter_map(Value::as_u64);
+        numbers.map(|number| number as u32).collect()
+    }
+
     /// Checks the settings of the worlds, without opening them. `n_robots`: the number of robots per world, if it was
     /// given.
     ///
@@ -142,17 +103,14 @@ impl WorldFlags {
         if let Some(name) = &self.instance {
             return Ok(Source::Server(Instance::new(name)?));
         }
-        let (mut flags, known) = self.simulation.separate()?;
+        let mut given = self.simulation.given();
+        let known = take_known_model(&mut given)?;
         if let Some(robots) = n_robots {
-            flags.worlds.insert("robots".into(), robots.into());
+            given.insert("robots".into(), robots.into());
         }
         let mut default = ServerConfig::default();
         default.world.burn_in = BURN_IN;
-        if n_robots.is_some_and(|robots| robots > 1) {
-            // With the same start and the same belief, all robots would fly the same path forever.
-            default.world.start = Start::Random;
-        }
-        let mut checked = flags.check(&default)?;
+        let mut checked = check(&given, default)?;
         let seeds = self.seeds_of(checked.task.as_ref());
         checked.config.seed = seeds.start;
         let n_worlds = (seeds.end - seeds.start).min(MAX_BATCH.into());
@@ -160,7 +118,6 @@ impl WorldFlags {
         Ok(Source::Settings(Box::new(checked), known.map(Box::new)))
     }
 
-    /// Returns the seeds to compare on.
     pub fn seeds(&self, source: &Source) -> Range<u64> {
         self.seeds_of(source.task())
     }
@@ -209,7 +166,10 @@ impl Source {
     /// If there is no such server, the worlds cannot be simulated, or the model of beliefs does not fit them.
     pub fn open(self, n_seeds: u32) -> Result<Arena> {
         match self {
-            Self::Server(instance) => Arena::open(Worlds::attach(&instance, true)?, n_seeds),
+            Self::Server(instance) => {
+                let arena = Arena::open(Worlds::attach(&instance, true)?, n_seeds);
+                arena.with_context(|| format!("instance {:?}", instance.name()))
+            }
             Self::Settings(checked, known) => {
                 let mut arena = Arena::open(Worlds::simulate(*checked)?, n_seeds)?;
                 known.map_or(Ok(()), |model| arena.know(*model))?;
@@ -219,10 +179,98 @@ impl Source {
     }
 }
 
+/// Checks the default settings with the values that were given.
+fn check(given: &Map<String, Value>, mut default: ServerConfig) -> Result<Checked, ConfigError> {
+    if given.get("robots").and_then(Value::as_u64) > Some(1) {
+        // With the same start and the same belief, all robots would fly the same path forever.
+        default.world.start = Start::Random;
+    }
+    default.with(given)?.check()
+}
+
+/// Takes the model of beliefs about recorded states from the settings. Simulated worlds keep their model.
+fn take_known_model(given: &mut Map<String, Value>) -> Result<Option<Model>> {
+    if given.get("states").is_none_or(|states| states == "") {
+        return Ok(None);
+    }
+    let name = given.remove("model");
+    let model = name.as_ref().and_then(Value::as_str).map(model_named);
+    let radius = given.get("sensor_radius").and_then(Value::as_u64);
+    Ok(match (model.transpose()?, radius) {
+        (Some(model), Some(radius)) => Some(model.with_radius(radius as usize)?),
+        (model, _) => model,
+    })
+}
+
 fn parse_seeds(text: &str) -> Result<Range<u64>, String> {
     let seeds: Range<u64> = parse_range(text)?;
     match seeds.end - seeds.start {
         1..=MAX_SEEDS => Ok(seeds),
         _ => Err(format!("expected 1 to {MAX_SEEDS} seeds")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Compare {
+        #[command(flatten)]
+        worlds: WorldFlags,
+    }
+
+    #[derive(Parser)]
+    struct Train {
+        #[command(flatten)]
+        worlds: SimulationFlags,
+    }
+
+    fn compare(flags: &str) -> WorldFlags {
+        Compare::parse_from(flags.split(' ')).worlds
+    }
+
+    #[test]
+    fn several_numbers_of_robots_are_for_comparisons() {
+        for (flags, robots) in [
+            ("", vec![]),
+            (" --robots 3", vec![3]),
+            (" --robots 4,1", vec![4, 1]),
+        ] {
+            assert_eq!(compare(&format!("compare{flags}")).robots(), robots);
+        }
+        let refused = Train::try_parse_from(["train", "--robots", "1,2"]);
+        let refused = refused
+            .err()
+            .map(|error| error.to_string())
+            .unwrap_or_default();
+        assert!(refused.contains("'1,2'"), "{refused}");
+        assert!(refused.contains("expected 1 to 64"), "{refused}");
+    }
+
+    #[test]
+    fn robots_of_a_team_start_in_random_cells() {
+        let train = Train::parse_from(["train", "--robots", "2"]).worlds;
+        let of_training = train.check(ServerConfig::default()).expect("valid").config;
+        assert_eq!(of_training.world.start, Start::Random);
+        let starts = [1, 2].map(|robots| match compare("compare").source(Some(robots)) {
+            Ok(Source::Settings(checked, _)) => checked.config.world.start,
+            _ => panic!("expected settings"),
+        });
+        assert_eq!(starts, [Start::Corner, Start::Random]);
+    }
+
+    #[test]
+    fn without_states_the_model_is_the_worlds() {
+        let flags = compare("compare --model wildfire-small --states=");
+        let Ok(Source::Settings(checked, known)) = flags.source(None) else {
+            panic!("expected settings");
+        };
+        assert_eq!(
+            checked.model,
+            model_named("wildfire-small").expect("built in")
+        );
+        assert_eq!(known, None);
     }
 }

@@ -116,30 +116,6 @@ pub enum ConfigError {
 }
 
 impl Checked {
-    /// Describes valid settings that are probably not meant: starts that no-fly cells enclose, states without rewards,
-    /// and a kernel with which filters predict badly.
-    pub fn warnings(&self) -> Vec<String> {
-        let starts = self.reach.closed_in.iter();
-        let mut warnings: Vec<String> = starts.map(ToString::to_string).collect();
-        if self.model.reward().iter().all(|&reward| reward == 0.0) {
-            warnings.push(format!(
-                "{}: no state pays: every reward will be 0; give a state a `reward` in the model file",
-                self.model.name()
-            ));
-        }
-        if let Some(uneven) = self.model.ratio().and_then(Ratio::uneven_place) {
-            let names = self.model.state_names();
-            let ([row, col], [least, most]) = (uneven.place, uneven.states.map(|it| &names[it]));
-            warnings.push(format!(
-                "kernel: expected weights of all states within a factor of 2, got a sum of {} for {least:?} and {} for \
-                 {most:?} in row {row}, column {col}, so filters predict badly: write transitions instead, by which each \
-                 neighbour tries independently:\n{TRANSITIONS_FORM}",
-                uneven.weights[0], uneven.weights[1],
-            ));
-        }
-        warnings
-    }
-
     /// Returns the same settings with another number of worlds.
     ///
     /// # Errors
@@ -149,6 +125,34 @@ impl Checked {
         self.config.check_ranges()?;
         self.config.check_robots(self.shape)?;
         Ok(self)
+    }
+
+    /// Describes settings that are valid, but with which robots or filters do badly.
+    pub fn warnings(&self) -> Vec<String> {
+        let model = &self.model;
+        let mut warnings: Vec<String> = self
+            .reach
+            .closed_in
+            .iter()
+            .map(ToString::to_string)
+            .collect();
+        if model.reward().iter().all(|&reward| reward == 0.0) {
+            warnings.push(format!(
+                "model {:?}: no state pays: every reward will be 0; give a state a `reward` in the model file",
+                model.name()
+            ));
+        }
+        if let Some(uneven) = model.ratio().and_then(Ratio::uneven_place) {
+            let ([row, col], [least, most]) = (uneven.place, uneven.states);
+            let names = model.state_names();
+            warnings.push(format!(
+                "kernel: expected weights of all states within a factor of 2, got a sum of {} for {:?} and {} for \
+                 {:?} in row {row}, column {col}, so filters predict badly: write transitions instead, by which each \
+                 neighbour tries independently:\n{TRANSITIONS_FORM}",
+                uneven.weights[0], names[least], uneven.weights[1], names[most],
+            ));
+        }
+        warnings
     }
 }
 

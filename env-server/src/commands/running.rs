@@ -16,24 +16,18 @@ const TIMEOUT: Duration = Duration::from_secs(5);
 #[derive(Args)]
 pub struct StatusCommand {
     #[command(flatten)]
-    target: Target,
+    target: StopCommand,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
 }
 
 /// Stops a running server.
 #[derive(Args)]
 pub struct StopCommand {
-    #[command(flatten)]
-    target: Target,
-}
-
-#[derive(Args)]
-struct Target {
     /// The server's instance name
     #[arg(long, default_value = "default")]
     instance: String,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
 }
 
 /// The answer to `status`, together with the name of the task that defines the worlds, if any.
@@ -50,7 +44,7 @@ impl StatusCommand {
     pub fn run(&self) -> Result<()> {
         let (info, reply) = self.target.ask(&Request::Status {})?;
         match reply {
-            Reply::Status(status) if self.target.json => {
+            Reply::Status(status) if self.json => {
                 let task = info.task.as_deref();
                 let named = NamedStatus { task, status };
                 Ok(print(&(serde_json::to_string_pretty(&named)? + "\n"))?)
@@ -64,11 +58,9 @@ impl StatusCommand {
 impl StopCommand {
     /// Asks the server to stop, and waits for its confirmation.
     pub fn run(&self) -> Result<()> {
-        self.target.ask(&Request::Shutdown {}).map(|_| ())
+        self.ask(&Request::Shutdown {}).map(drop)
     }
-}
 
-impl Target {
     /// Sends a request. Returns the server's description, from the handshake, and its reply.
     fn ask(&self, request: &Request) -> Result<(ServerInfo, Reply)> {
         let instance = Instance::new(&self.instance)?;

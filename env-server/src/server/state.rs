@@ -163,16 +163,17 @@ fn announce(checked: &Checked) {
         seed = config.seed,
         "serving"
     );
-    warn(checked);
+    announce_settings(checked);
 }
 
-/// Logs the warnings about the settings, and how many free cells cannot be reached from random starts.
-pub fn warn(checked: &Checked) {
+/// Logs how many free cells cannot be reached from random starts, and warns of settings that do badly.
+pub fn announce_settings(checked: &Checked) {
     if let Some(words) = checked.reach.cut_off() {
         tracing::info!("{words}");
     }
-    let warnings = checked.warnings();
-    warnings.iter().for_each(|words| tracing::warn!("{words}"));
+    for warning in checked.warnings() {
+        tracing::warn!("{warning}");
+    }
 }
 
 /// Creates the worlds. Restores worlds from a snapshot if the settings name one. Also returns the reset jobs for the

@@ -15,7 +15,6 @@ pub struct ObjectiveConfig {
     pub shooting_bonus: f32,
     pub beam_bonus: f32,
     pub entropy: EntropyKind,
-    pub revisits: bool,
     pub belief: BasisKind,
 }
 

@@ -24,18 +24,6 @@ pub(super) const NAMED: &[(&str, &str)] = &[
     ("oracle_policy", "truth/options/rule"),
 ];
 
-/// Short names of earlier versions, or their beginnings, each with its parts. They are refused.
-const FORMER: &[(&str, &str)] = &[
-    ("shooting_", "known/shooting/"),
-    ("beam_", "known/beam/"),
-    ("spatial_shooting", "known+spatial/shooting/exploit"),
-    ("spatial_beam", "known+spatial/beam/exploit"),
-    ("learned_spatial_beam", "learned+spatial/beam/exploit"),
-    ("autoencoder_exploit", "autoencoder/shooting/exploit"),
-    ("autoencoder_policy", "autoencoder/shooting/learned"),
-    ("oracle_shooting", "truth/shooting/exploit"),
-];
-
 /// Goals of all planners except `options`. The states of the model are goals as well.
 pub(super) const GOALS: &[(Goal, &str, &str)] = &[
     (Goal::Coverage, "coverage", "new cells only"),
@@ -187,19 +175,18 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
 
 /// Returns the error for a name that is neither short nor made of parts.
 fn unknown(name: &str) -> String {
-    let mut former = FORMER.iter().filter_map(|(old, parts)| {
-        let rest = name.strip_prefix(old)?;
-        (rest.is_empty() != old.ends_with('_')).then(|| format!("{parts}{rest}"))
-    });
     let got = shortened(name);
-    match former.next() {
-        Some(parts) => format!("policy: {got:?} is not a short name any more: use {parts}"),
-        None => format!(
-            "policy: expected one of {}, or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit (see `compare \
-             --policies help`), got {got:?}",
-            listed(NAMED.iter().map(|(name, _)| *name))
-        ),
+    // Short names of earlier versions were made of planner and goal; the belief was `known`.
+    if let Some((planner @ ("beam" | "shooting"), goal)) = name.split_once('_')
+        && !goal.is_empty()
+    {
+        return format!("policy: {got:?} is not a short name any more: use known/{planner}/{goal}");
     }
+    format!(
+        "policy: expected one of {}, or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit (see `compare \
+         --policies help`), got {got:?}",
+        listed(NAMED.iter().map(|(name, _)| *name))
+    )
 }
 
 /// Returns the goals that planners other than `options` accept, without the states of the model.
@@ -322,7 +309,6 @@ mod tests {
                 "\"beam_exploit\" is not a short name any more: use known/beam/exploit",
             ),
             ("shooting_latent", ": use known/shooting/latent"),
-            ("spatial_beam", ": use known+spatial/beam/exploit"),
         ] {
             let error = Policy::named(name, &model).expect_err(name).to_string();
             assert!(error.contains(words), "{error}");

@@ -111,7 +111,6 @@ impl Policy {
             target,
             coverage_bonus,
             entropy: settings.entropy,
-            revisits: settings.revisits,
         }
     }
 }
@@ -158,7 +157,6 @@ mod tests {
     fn settings_of_the_objective_reach_the_policies() {
         let mut config = AgentConfig::default();
         config.objective.shooting_bonus = 3.0;
-        config.objective.revisits = true;
         for (name, bonus, target) in [
             ("known/shooting/explore", 3.0, Target::Entropy),
             ("known/shooting/latent", 3.0, Target::State(1)),
@@ -169,6 +167,5 @@ mod tests {
             let got = objective(name, &config);
             assert_eq!((got.coverage_bonus, got.target), (bonus, target), "{name}");
         }
-        assert!(objective("beam", &config).revisits);
     }
 }

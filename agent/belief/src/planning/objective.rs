@@ -51,15 +51,13 @@ impl Target {
     }
 }
 
-/// The quantity that a planner maximises: the sum of the target over the path's cells, plus a bonus per distinct cell.
+/// The quantity that a planner maximises: the sum of the target over the path's cells, plus a bonus per cell.
+/// A cell counts once, as in the authors' code and in the reward; in eq. 15, each visit counts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Objective {
     pub target: Target,
     pub coverage_bonus: f32,
     pub entropy: EntropyKind,
-    /// Whether a cell's value counts at every visit, as printed in eq. 15. Otherwise it counts at the first visit only,
-    /// as in the authors' code and in the reward.
-    pub revisits: bool,
 }
 
 /// The value that a planner assigns to each cell of the grid. All values are finite.
@@ -68,7 +66,6 @@ pub struct CellValues {
     /// The value of a cell on the path.
     value: Grid<f32>,
     coverage_bonus: f32,
-    revisits: bool,
     /// The value of each cell in sight of the path. `None` if only cells on the path count, or if the sensor sees no
     /// other cells.
     in_sight: Option<Grid<f32>>,
@@ -84,7 +81,6 @@ impl Objective {
             target,
             coverage_bonus,
             entropy: EntropyKind::Sum,
-            revisits: false,
         }
     }
 
@@ -94,7 +90,6 @@ impl Objective {
             target,
             coverage_bonus: 1.0,
             entropy: EntropyKind::Mean,
-            revisits: false,
         }
     }
 
@@ -115,10 +110,7 @@ impl Objective {
             Target::Entropy => belief.entropy(self.entropy),
             Target::Coverage => Grid::zeros(belief.shape().dim()),
         };
-        let values = CellValues {
-            revisits: self.revisits,
-            ..CellValues::new(value, self.coverage_bonus)
-        };
+        let values = CellValues::new(value, self.coverage_bonus);
         if self.target == Target::Entropy && airspace.radius() > 0 {
             CellValues::in_sight_of(airspace, values.value + self.coverage_bonus)
         } else {
@@ -136,7 +128,6 @@ impl CellValues {
             airspace: Airspace::open(shape),
             value,
             coverage_bonus,
-            revisits: false,
             in_sight: None,
         }
     }
@@ -217,16 +208,13 @@ impl CellValues {
     /// Returns the values that remain after a teammate's path: cells that the teammate visits or sees are worth
     /// nothing.
     ///
-    /// `visited` lists the row-major indices of the teammate's cells, and may repeat them. If revisits count, cells on
-    /// the teammate's path keep their value.
+    /// `visited` lists the row-major indices of the teammate's cells, and may repeat them.
     pub fn without(&self, visited: &[usize]) -> Self {
         let mut left = self.clone();
-        if !left.revisits {
-            let value = left.value.as_slice_mut();
-            let value = value.expect("invariant: grids are row-major");
-            let taken = visited.iter();
-            taken.for_each(|&cell| value[cell] = -left.coverage_bonus);
-        }
+        let value = left.value.as_slice_mut();
+        let value = value.expect("invariant: grids are row-major");
+        let taken = visited.iter();
+        taken.for_each(|&cell| value[cell] = -left.coverage_bonus);
         if let Some(in_sight) = &mut left.in_sight {
             let in_sight = in_sight.as_slice_mut();
             let in_sight = in_sight.expect("invariant: grids are row-major");
@@ -240,11 +228,6 @@ impl CellValues {
         self.coverage_bonus
     }
 
-    /// Returns whether a cell's value counts at every visit.
-    pub fn revisits(&self) -> bool {
-        self.revisits
-    }
-
     /// Computes the score of the path from `start`, flown by the rules of [`Airspace::fly`].
     pub fn score(&self, start: Cell, moves: &[Move]) -> f32 {
         let shape = self.shape();
@@ -254,12 +237,9 @@ impl CellValues {
         for step in moves {
             cell = self.airspace.after(*step, cell);
             let value = self.value[[cell.row, cell.col]];
-            let first = !std::mem::replace(&mut visited[shape.index(cell)], true);
-            score += match (first, self.revisits) {
-                (true, _) => value + self.coverage_bonus,
-                (false, true) => value,
-                (false, false) => 0.0,
-            };
+            if !std::mem::replace(&mut visited[shape.index(cell)], true) {
+                score += value + self.coverage_bonus;
+            }
         }
         score
     }

@@ -52,8 +52,7 @@ impl Reach {
         let bonus = values.coverage_bonus();
         let cells = values.value();
         let cells = cells.slice(ndarray::s![top..bottom, left..right]);
-        let again = if values.revisits() { 1.0 } else { 0.0 };
-        let gains = |&value: &f32| [value + bonus, again * value];
+        let gains = |&value: &f32| [value + bonus, 0.0];
         self.gains.clear();
         self.gains.extend(cells.iter().map(gains));
         if let Some(map) = values.airspace().no_fly() {

@@ -22,8 +22,7 @@ fn airspace(key: u64, shape: Shape, start: Cell, radius: usize) -> Airspace {
     Airspace::new(shape, Some(Arc::new(map)), radius)
 }
 
-/// Computes the score of the robots' paths from the set of their cells, each of which counts once. If revisits count,
-/// each visit counts instead.
+/// Computes the score of the robots' paths from the set of their cells, each of which counts once.
 fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]]) -> f32 {
     let shape = air.shape();
     let value = |at: (usize, usize)| match objective.target {
@@ -35,13 +34,12 @@ fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]])
         Target::Entropy => air.radius(),
         _ => 0,
     };
-    let (mut counted, mut visits) = (BTreeSet::new(), 0.0);
+    let mut counted = BTreeSet::new();
     for path in paths {
         let mut cell = field.starts[0];
         for step in *path {
             let next = step.apply(cell, shape);
             cell = if air.is_free(next) { next } else { cell };
-            visits += value((cell.row, cell.col));
             for (row, col) in ndarray::indices(shape.dim()) {
                 if row.abs_diff(cell.row).max(col.abs_diff(cell.col)) <= radius {
                     counted.insert((row, col));
@@ -50,9 +48,6 @@ fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]])
         }
     }
     let bonus = objective.coverage_bonus * counted.len() as f32;
-    if objective.revisits && radius == 0 {
-        return visits + bonus;
-    }
     counted.into_iter().map(value).sum::<f32>() + bonus
 }
 
@@ -74,13 +69,12 @@ proptest! {
         (height, width) in (1_usize..9, 1_usize..9),
         radius in 0_usize..4,
         target in prop_oneof![Just(Target::State(0)), Just(Target::Entropy), Just(Target::Coverage)],
-        revisits in any::<bool>(),
     ) {
         let shape = Shape::new(height, width).expect("test shape");
         let start = shape.cell((key % shape.n_cells() as u64) as usize);
         let air = airspace(key, shape, start, radius);
         let field = Field::new(shape, vec![start], 5, key);
-        let objective = Objective { coverage_bonus: 0.1, revisits, ..Objective::new(target) };
+        let objective = Objective { coverage_bonus: 0.1, ..Objective::new(target) };
         let values = objective.values_in(&field.belief, &air);
         let mut best = f32::NEG_INFINITY;
         for code in 0..4_u64.pow(5) {
@@ -102,9 +96,8 @@ proptest! {
             let plan = planner.plan(&problem);
             let flown = score(objective, &field, &air, &[&plan.moves]);
             prop_assert!((plan.score - flown).abs() < 1e-4, "{} {flown}", plan.score);
-            // With revisits, paths over the same cells can have different scores. Beam search keeps only one of them.
             let is_best = (plan.score - best).abs() < 1e-4;
-            prop_assert!(!is_exact || revisits || is_best, "{} {best}", plan.score);
+            prop_assert!(!is_exact || is_best, "{} {best}", plan.score);
             prop_assert!(avoids(&air, start, &plan.moves));
         }
         // A robot gains nothing from cells that a teammate sees or visits.
@@ -112,7 +105,7 @@ proptest! {
         let team = plan_team(&mut BeamSearch::new(20), &values, &team, 5, random, 0);
         let paths = [0, 1].map(|robot| &*team[robot].moves);
         let (gains, together) = (team[0].score + team[1].score, score(objective, &field, &air, &paths));
-        prop_assert!(revisits || (gains - together).abs() < 1e-3, "{gains} {together}");
+        prop_assert!((gains - together).abs() < 1e-3, "{gains} {together}");
         let outlook = Outlook::new(&field.belief, &air, 0, &Memory::new(shape), 5);
         let proposals = OptionPlanner::new(20).propose(&outlook, start);
         prop_assert_eq!(proposals.len(), OPTIONS.len());

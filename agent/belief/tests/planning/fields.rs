@@ -71,9 +71,8 @@ pub fn objectives() -> impl Strategy<Value = Objective> {
         Just(Target::Entropy),
         Just(Target::Coverage),
     ];
-    let objectives = (targets, any::<bool>(), 0.0..2.0_f32);
-    objectives.prop_map(|(target, revisits, coverage_bonus)| Objective {
-        revisits,
+    let objectives = (targets, 0.0..2.0_f32);
+    objectives.prop_map(|(target, coverage_bonus)| Objective {
         coverage_bonus,
         ..Objective::new(target)
     })

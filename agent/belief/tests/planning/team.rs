@@ -27,7 +27,7 @@ impl<'a> Team<'a> {
         plan_team(planner, &self.values, starts, n_moves, RANDOM, rounds)
     }
 
-    /// Returns the team's gain. Each cell counts once, however many robots visit it, unless revisits count.
+    /// Returns the team's gain. Each cell counts once, however many robots visit it.
     fn worth(&self, plans: &[Plan]) -> f64 {
         let paths: Vec<&[Move]> = plans.iter().map(|plan| &*plan.moves).collect();
         self.worth_of(&paths)
@@ -35,10 +35,6 @@ impl<'a> Team<'a> {
 
     fn worth_of(&self, paths: &[&[Move]]) -> f64 {
         let robots = self.field.starts.iter().zip(paths);
-        if self.values.revisits() {
-            let own = robots.map(|(&start, path)| self.values.score(start, path));
-            return own.map(f64::from).sum();
-        }
         let shape = self.values.shape();
         let visited = robots.flat_map(|(&start, path)| fly(shape, start, path).visited);
         let cells: BTreeSet<usize> = visited.collect();

@@ -44,11 +44,14 @@ fn authors_network() -> Autoencoder {
     };
     let mut network = Autoencoder::new(settings, shape, 0, &Device::Cpu).expect("a network");
     let find = |name: &str, dims: &[usize]| {
+        if name.starts_with("adam.") {
+            return Ok(vec![0.0; dims.iter().product()]);
+        }
         let array: ArrayD<f32> = Golden::open("a4_net_weights").get::<f32, IxDyn>(name);
         assert_eq!(array.shape(), dims, "{name}");
         Ok::<_, NetworkError>(array.as_slice().expect("row-major").to_vec())
     };
-    network.load_variables(find).expect("the authors' sizes");
+    network.load(find, [0, 0]).expect("the authors' sizes");
     network
 }
 

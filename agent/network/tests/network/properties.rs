@@ -4,12 +4,17 @@ use crate::synthetic::{frames, rayon_pool};
 use candle_core::Tensor;
 use emberwatch_model::grid::Shape;
 use emberwatch_network::{
-    Autoencoder, AutoencoderSettings, Device, NamedTensor, NetworkError, NetworkShape, NotFinite,
-    Window,
+    AdamSettings, Autoencoder, AutoencoderSettings, Device, NamedTensor, NetworkError,
+    NetworkShape, NotFinite, Window,
 };
 
 fn network(grid: [usize; 2], seed: u64) -> Autoencoder {
-    let settings = AutoencoderSettings::paper_large();
+    let settings = AutoencoderSettings {
+        encoding: 16,
+        hidden: 16,
+        adam: AdamSettings::paper(1e-3),
+        ..AutoencoderSettings::paper()
+    };
     let shape = NetworkShape {
         grid: Shape::new(grid[0], grid[1]).expect("shape"),
         n_states: 3,

@@ -133,7 +133,6 @@ impl Entry {
         self.about.training_seconds = self.about.training_seconds.or(recorded);
     }
 
-    /// Returns the runs on a task.
     fn on(&self, task: &str) -> impl Iterator<Item = &PolicyRun> {
         self.runs.iter().filter(move |run| run.task == task)
     }
