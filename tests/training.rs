@@ -295,7 +295,7 @@ train --out OUT --instance x --height 9 => --instance | --height
 train --out OUT --time-limit=-1 => --time-limit | expected a number of seconds
 train --out OUT --model no.toml => model file no.toml | No such file
 train --out OUT --world 3 => --instance
-train --out OUT --robots 1,2 => --robots: expected one number of robots per world, got 2
+train --out OUT --robots 1,2 => --robots | expected 1 to 64
 train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: No such file
 compare --checkpoint no/such => checkpoint no/such: No such file
 ";
