@@ -82,11 +82,12 @@ def same_arrivals(f: Path) -> list[tuple[object, ...]]:
         np.save(f / f"{number}.npy", values)
         for file in (geotiff(f / f"{number}.tif", values, nodata=None), f / f"{number}.npy"):
             files.append((file, *minutes, f"--nodata={number}"))
-    for word in ("null", "*", "1.#QNAN", "nan", "-9999.00"):  # all mean "no value"
+    for word in ("nan", "-9999.00"):  # both mean "no value"
         file = ascii_grid(f / f"{len(files)}.asc")
-        text = file.read_text().replace("value -9999.0", f"value {word}")
-        file.write_text(text if word == "-9999.00" else text.replace("-9999.0", word.lower()))
+        file.write_text(file.read_text().replace("value -9999.0", f"value {word}"))
         files.append((file, *minutes))
+        if word == "nan":
+            file.write_text(file.read_text().replace("-9999.0", word))
     for values, numbers in (  # rotations caused by rounding
         (ARRIVAL, (30, 6e-17, 500_000, 6e-17, -30, 4_000_000)),
         (ARRIVAL[::-1, ::-1], (-30, 4e-15, 500_000, 4e-15, 30, 4_000_000)),
@@ -207,11 +208,11 @@ BEGINS: list[tuple[str, str | None, str | None]] = [
     ("minutes since 2020-08-01 12:00 -07:00", None, "2020-08-01 20:30:00 UTC"),
     ("minutes since 2020-08-01 12:00 -0330", None, "2020-08-01 17:00:00 UTC"),
     ("minutes since 2020-08-01 12:00 -00:30", None, "2020-08-01 14:00:00 UTC"),
-    ("minutes since 9999-12-31 23:00 -05:00", None, None),
-    ("minutes since 2020-08-01", "noleap", None),
+    ("minutes since 2020-02-29", "noleap", None),
+    ("minutes since 2020-02-28 23:00", "noleap", "2020-03-01 00:30:00 UTC (noleap calendar)"),
     ("minutes since 2020-02-31", None, None),
     ("minutes since ignition", None, None),
-    ("minutes since 1-1-1", None, None),
+    ("hours since 1-1-1", None, "0001-01-04 18:00:00 UTC"),
     ("minutes", None, None),
 ]
 

@@ -92,7 +92,7 @@ def test_elevation_is_the_same_from_each_format(tmp_path: Path) -> None:
 
 
 def test_classes_of_fuel_have_their_factors(tmp_path: Path) -> None:
-    values, towns = [[3, 3, -1], [8, 3, 8]], [[0, 0, 2.5], [0, 0, -1]]
+    values, towns = [[3, 3, 1], [8, 3, 8]], [[0, 0, 2.5], [0, 0, 1]]
     fuel = geotiff(tmp_path / "fuel.tif", values, nodata=None)
     no_fly = array(tmp_path / "no.npy", towns)
     flags = ("--fuel", fuel, "--factors=3=2.5", "--unburnable", 8, "--no-fly", no_fly)

@@ -134,11 +134,6 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
         numbers(np.where(ARRIVAL == 300, -1, np.where(ARRIVAL == 0, -2, ARRIVAL)),
         missing_value=np.array([-3, -1], "i2"), _FillValue=-2),
         steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60))),
-    "never written": (numbers(np.where(ARRIVAL == 300, -32767, ARRIVAL)), WITHOUT_LAST),
-    "unsigned": (
-        grid(Variable((ARRIVAL // 2 + 100).astype("u1").view("i1"), "i1",
-        ("y", "x")).told(units="s", _Unsigned="true", scale_factor=2.0, valid_max=np.int8(-36))),
-        WITHOUT_LAST),
     # Time.
     "time": (timed("f8", [0, 1, 2, 3]), FIRE[:4]),
     "both of time": (timed("i1", [0, 1, 2, 3], scale_factor=1 / 60, add_offset=5.0, units="hours"),
@@ -197,7 +192,7 @@ def test_cf_attributes_are_applied(case: str, tmp_path: Path) -> None:
 
 
 def test_any_file_name_can_be_read(tmp_path: Path) -> None:
-    for name in ('a"b', "a'b", "a:b", "a#b", "a b", "\udce9"):
+    for name in ('a"b', "a'b", "a:b", "a#b", "a b"):
         file = written(tmp_path / "plain.nc", **grid(ONE)).rename(tmp_path / f"{name}.nc")
         np.testing.assert_array_equal(imported(file, 2, "--name=fire"), FIRE)
 
@@ -242,18 +237,6 @@ def test_the_start_date_includes_the_offset_of_packed_times(tmp_path: Path) -> N
     assert "# states_000 begins at 2020-08-01 01:30:00 UTC" in text
 
 
-@pytest.mark.parametrize("kind", [None, "f8", "i2"])
-def test_bounds_of_the_same_type_inherit_packing(kind: str | None, tmp_path: Path) -> None:
-    given = {"scale_factor": 15.0, "add_offset": 500_000.0, "valid_min": np.int16(0)}
-    edged = {**bounded(X, "x"), "y": Y, "v": ONE}
-    if kind is not None:
-        for name in ("x", "edges") if kind == "i2" else ("x",):
-            whole = (np.asarray(edged[name].values) - 500_000) / 15
-            edged[name] = edged[name]._replace(values=whole, kind="i2")
-        edged["x"] = edged["x"].told(**given)
-    np.testing.assert_array_equal(layer_files(tmp_path, grid(ONE), edged), MASKS[[0, 2]])
-
-
 def test_longitudes_of_0_to_360_degrees_are_wrapped(tmp_path: Path) -> None:
     west, east = (
         {
@@ -284,22 +267,18 @@ CURVED = Variable(np.zeros((3, 4)), "f8", ("y", "x"), {"units": "degrees_north"}
 REFUSED: list[tuple[Any, ...]] = [
     ("a.nc, x: expected cells of one size side by side, got some of 30 and some of 90",
         grid(ONE, x=X._replace(values=[15, 45, 75, 165]))),
-    ("a.nc, x: expected cells of one size side by side, got some of 20 and some of 30",
-        {**bounded(X, "x", half=10.0), "y": Y, "v": ONE}),
     ("a.nc, x: expected cells of one size side by side, got some of 0 and some of 0",
         grid(ONE, x=X._replace(values=[15, 15, 15, 15]))),
     ("a.nc, x: expected cells of one size side by side, got some of nan",
         grid(ONE, x=X._replace(values=[15, 45, -1, 105]).told(missing_value=-1.0))),
     ("a.nc, x: expected cells of one size side by side, got some of 30 and some of inf",
         grid(ONE, x=X._replace(values=[-np.inf, 45, 75, np.inf]))),
-    ("a.nc, x, bounds: expected two for each cell, got 'edges'",
-        grid(ONE, x=X.told(bounds="edges"))),
     ("a.nc, x, units: expected degrees, m, km or feet, got 'furlongs'",
         grid(ONE, x=X.told(units="furlongs"))),
     ("a.nc, Lat, units: expected degrees, m, km or feet, got ''",
         {"Lat": Variable(LAT.values, "f8", ("Lat",)), "lon": LON, "v": ONE._replace(over=("Lat",
         "lon"))}),
-    ("a.nc: expected rows and columns in one unit, got degrees and metres",
+    ("a.nc: expected coordinates in degrees, as its grid mapping or columns, got metres",
         grid(ONE, x=X.told(units="degrees_east"))),
     ("a.nc: expected a variable with the dimensions time, rows and columns, got one with y, x",
         grid(ONE, y=Y.told(axis="X"))),
@@ -309,17 +288,16 @@ REFUSED: list[tuple[Any, ...]] = [
         {"axis": "Z"}))),
     ("a.nc: expected coordinates with one dimension, got lat with y, x; reproject it",
         {"lat": CURVED, "v": ONE.told(coordinates="lat lon")}),
-    ("a.nc: expected cells, got 0 x 3 x 4",
+    ("a.nc: expected real numbers, got uint8 (0, 3, 4)",
         {"v": Variable(np.zeros((0, 3, 4)), "u1", ("time", "y", "x"))}),
-    ("a.nc, scale_factor: expected a number, got 0.1", grid(ONE.told(scale_factor="0.1"))),
-    ("a.nc, valid_range: expected two numbers, got 3", grid(ONE.told(valid_range=np.int16(3)))),
-    ("a.nc, valid_max: expected the type of the numbers, int16, or of scale_factor, float64",
-        packed(valid_max=np.float32(1500))),
+    ("a.nc, v, valid range: expected two signed numbers, got 3",
+        grid(ONE.told(valid_range=np.int16(3)))),
     ("expected times in days or smaller units, got 'months since 2020-08-01'; give the",
         timed("f8", [0, 1, 2, 3], units="months since 2020-08-01")),
     ("a.nc, band 3: expected a time, got nan", timed("f8", [0, 1, -1, 3], missing_value=-1.0)),
     ("a.nc, time: expected no climatology, got 'edges'",
-        timed("f8", [0, 1, 2, 3], climatology="edges")),
+        timed("f8", [0, 1, 2, 3], climatology="edges")
+        | {"edges": Variable(np.zeros((4, 2)), "f8", ("time", "two"))}),
     ("flag_meanings: expected 0 to mean unburnt, got 'burnt'; --kind and --codes set",
         grid(TIMES.told(flag_values=np.array([0, 1, 2], "u1"),
         flag_meanings="burnt fire unburnt")), ("--kind=states",)),

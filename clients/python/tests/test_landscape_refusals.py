@@ -13,7 +13,6 @@ from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
 from emberwatch.landscape.__main__ import main
 from emberwatch.landscape.fire import MOST_STATES
 from emberwatch.landscape.layers import MOST_CELLS
-from emberwatch.landscape.numpy_file import MOST_BYTES
 
 ARRIVALS = ("--kind", "arrival", "--step", "10 min", "--burning", "2", "--unit", "min")
 MASKS = ("--kind", "mask", "--step", "10 min", "--burning", "2")
@@ -110,26 +109,22 @@ def at(*times: float) -> Case:
 CASES: list[tuple[str, Case]] = [
     ("expected a file or folder, got none", lambda f: (f / "no.tif", *ARRIVALS)),
     ("expected rasters in this folder, got none", lambda f: (f, *MASKS)),
-    (".npz, got '.grd'", lambda f: (text(f / "fire.grd", ""), *MASKS)),
+    ("got '.grd'", lambda f: (text(f / "fire.grd", ""), *MASKS)),
     ("got '.txt'", lambda f: (folder_with(f, "notes.txt"), *MASKS)),
     ("a.tif: expected each file once, got this one twice",
         lambda f: (geotiff(f / "a.tif"), f / "." / "a.tif", *MASKS)),
     ("expected a NetCDF file, got", lambda f: (text(f / "a.nc", "CDF\1"), *ARRIVALS)),
     ("expected an ESRI ASCII grid, got", lambda f: (text(f / "a.asc", "ncols 3\nrows"), *ARRIVALS)),
     ("a.asc: expected 12 numbers for 3 x 4 cells, got 14", ascii_file("20.0", "20.0 20.0")),
-    ("a.asc: expected numbers, got 'x'; NODATA_value can define a word for no value",
+    ("ESRI ASCII grid, got: could not convert string to float: b'x'",
         ascii_file("35.0", "x")),
-    ("expected a NumPy file, got", lambda f: (text(f / "a.npz", "hello"), *MASKS)),
-    ("(layers, rows, columns), got object (1,)",
-        lambda f: (array(f, np.array([{}], object)), *MASKS)),
-    ("a.npy: expected at most 134217728 cells, got 1048576 x 1048576",
+    ("a.npy: expected a NumPy file, got: mmap length is greater than file size",
         lambda f: (claim(f / "a.npy", (1 << 20, 1 << 20)), *MASKS)),
-    ("a.npy: expected at most 4294967296 bytes of numbers, got 8589934592: uint8 (1048576,",
-        lambda f: (claim(f / "a.npy", (1 << 20, 64, 128)), *MASKS)),
-    ("a.npz: expected at most 4294967296 bytes of numbers, got 4398046511104",
+    ("a.npz: expected a NumPy file, got: Unable to allocate",
         lambda f: (packed(f / "a.npz", claim(f / "a.npy", (1 << 40, 2, 2))), *MASKS)),
-    ("a.npz: expected a NumPy file, got",
-        lambda f: (packed(f / "a.npz", text(f / "a.npy", "hello, world")), *MASKS)),
+    ("(layers, rows, columns), got complex128 (3, 4)",
+        lambda f: (array(f, ONE.astype(complex)), *MASKS)),
+    ("expected a NumPy file, got", lambda f: (text(f / "a.npz", "hello"), *MASKS)),
     ("expected real numbers, got complex64",
         arrivals(bands=[ARRIVAL], dtype="complex64", nodata=None)),
     ("expected one band of arrival times, got 3; choose with --band",
@@ -173,7 +168,7 @@ CASES: list[tuple[str, Case]] = [
     ("expected a later time than 600, got 300", at(0, 600, 300, 900)),
     ("band 2: expected a time, got nan", at(0, float("nan"), 1200, 1800)),
     ("expected times 600 apart, like the first ones, got 1200", at(0, 600, 1200, 2400)),
-    ("band 1: expected a later time than 2020-08-02 01:00:00+00:00, got 2020-08-01 00:00:00",
+    ("band 1: expected a later time than 2020-08-02 01:00:00 UTC, got 2020-08-01 00:00:00",
         lambda f: (*days(f, "hours since 2020-08-02", "hours since 2020-08-01"), *MASKS)),
     ("expected times in 'hours since 2020-08-01' (standard) as in ",
         lambda f: (*days(f, "hours since 2020-08-01", "hours since start"), *MASKS)),
@@ -201,13 +196,13 @@ CASES: list[tuple[str, Case]] = [
         arrivals("--height", 2)),
     ("--begin: applies only with --kind arrival, got --kind mask",
         lambda f: (geotiff(f / "a.tif"), *MASKS, "--begin", 0)),
-    ("--step: too short for times up to 50, got ", arrivals("--step", "1e-310 s")),
+    ("--step: too short for times up to 50, got ", arrivals("--step", "1e-310 s", dtype="int16")),
     ("--resample: no cell burns on the grid of 1 x 1 cells; use 'earliest'",
         lambda f: (stack(f, ONE, ONE), *MASKS, "--resample=nearest", "--height=1",
         "--crop=0,1,3,3")),
     ("expected at least 2 steps, got 1", layers(MASKS, ONE)),
-    ("bytes of states, got 4999999899 steps of 3 x 4",
-        arrivals(bands=[np.where(ARRIVAL < 0, NEVER, ARRIVAL * 1e9)])),
+    ("bytes of states, got 5000000001 steps of 3 x 4",
+        arrivals(bands=[np.where(ARRIVAL < 0, NEVER, ARRIVAL * 1e9)], dtype="float64")),
     ("at most 4096 x 4096 cells, the server's maximum", lambda f: (large(f), *MASKS)),
     ("at most 4096 x 4096 cells, the server's maximum, got 4097 x 5463",
         arrivals("--height", 4097)),
@@ -344,6 +339,5 @@ def test_the_limits_are_documented() -> None:
     for words in (
         f"more than {MOST_STATES >> 30} GiB of states",
         f"a layer of more than {MOST_CELLS:,} cells",
-        f"a NumPy array of more than {MOST_BYTES >> 30} GiB",
     ):
         assert words in page

@@ -312,7 +312,7 @@ def test_a_grid_mapping_sets_the_size_of_netcdf_cells(
         assert cells is not None
         assert [float(one) for one in cells.groups()] == pytest.approx([size] * 2, rel=5e-3)
     file = mapped(tmp_path / "dem.nc", "m", 1.0, NEW_YORK, crs_wkt=CRS("EPSG:4326").to_wkt())
-    words = "expected coordinates in degrees, the unit of its grid mapping, got metres"
+    words = "expected coordinates in degrees, as its grid mapping or columns, got metres"
     assert words in refused(capsys, tmp_path, file)
     file = mapped(tmp_path / "dem.nc", "m", 1.0, NEW_YORK, grid_mapping_name="mine")
     words = "a projection that gives their size, got mine; give --cell METRES"

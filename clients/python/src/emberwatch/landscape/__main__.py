@@ -5,7 +5,6 @@ import math
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -18,31 +17,20 @@ from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape import land
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
-from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
+from emberwatch.landscape.grid import Place, check_alike
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice
 from emberwatch.landscape.lengths import side
+from emberwatch.landscape.order import ORDERS
 from emberwatch.landscape.schedule import length
 from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
 
 _NAME: Final = "python -m emberwatch.landscape"
-_EXAMPLES: Final = """
-examples:
-  # Arrival times in seconds (as from ELMFIRE); a cell burns for 6 steps of 10 minutes:
-  python -m emberwatch.landscape time_of_arrival.tif --kind arrival --unit s --step "10 min" \\
-      --burning 6 --cell 120 --out world.npz
-  # Masks of all cells that have burnt so far, one file for each time:
-  python -m emberwatch.landscape folder --kind mask --step "1 h" --burning 3 --height 64 \\
-      --out world.npz
-  # A NetCDF variable of the codes 0, 1, 2 with a time dimension:
-  python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" \\
-      --out world.npz
-
-`python -m emberwatch.landscape land` makes a model file from elevation, wind and fuel.
-"""
 #: Flags that apply only to some values of `--kind`.
 _ONLY_FOR: Final = {
     "begin": ("arrival",),
+    "year_days": ("arrival",),
+    "time_column": ("arrival",),
     "burning": ("arrival", "mask"),
     "codes": ("states",),
     "every": ("mask", "burning", "states"),
@@ -73,8 +61,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Make a recorded world for `emberwatch-server --states` from rasters: GeoTIFF "
         "(.tif), ESRI ASCII grid (.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md "
         "describes all rules.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="`python -m emberwatch.landscape land` makes a model from elevation, wind and fuel.",
     )
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="IN", help="files, or a folder for each sequence")
@@ -94,9 +81,28 @@ def _parser() -> argparse.ArgumentParser:
         "this time; states: layers of codes",
     )
     add("--step", required=True, metavar="TIME", help="duration of a step, such as '10 min'")
-    add("--unit", choices=("s", "min", "h", "d"), help="unit of times in the files [the file's]")
+    add(
+        "--unit",
+        choices=("ms", "s", "min", "h", "d"),
+        help="unit of times in the files [the file's]",
+    )
     add("--begin", type=float, metavar="X", help="arrival time of step 0 [the earliest]")
     add("--burning", type=_whole, metavar="N", help="steps that a cell burns (arrival, mask)")
+    add(
+        "--year-days",
+        type=_whole,
+        metavar="365|366",
+        help="arrivals are days of the year; those after New Year are in the year after this one",
+    )
+    add(
+        "--time-column", metavar="NAME", help="the times of perimeters, if several columns could be"
+    )
+    add(
+        "--order",
+        choices=ORDERS,
+        help="order of a folder's files: by the numbers in their names, or by dates of day, month "
+        "and year, or of month, day and year [from the names, if they are clear]",
+    )
     add("--every", type=_whole, metavar="N", help="make a step of every N-th layer [1]")
     add("--codes", type=_codes, metavar="U,B,D", help="codes of unburnt, burning, burnt [0,1,2]")
     add("--variable", metavar="NAME", help="the variable, if a NetCDF or .npz file has several")
@@ -138,18 +144,26 @@ def _import(flags: argparse.Namespace) -> None:
     check_outputs(flags.out, flags.picture, force=flags.force)
     if flags.picture is not None and find_spec("PIL") is None:
         raise InvalidArgumentError("--picture: expected Pillow; pip install emberwatch[landscape]")
-    choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
-    sequences, begins = list[NDArray[np.uint8]](), list[datetime | None]()
+    is_arrival = meaning.kind == "arrival"
+    choice = Choice(
+        variable=flags.variable,
+        band=flags.band,
+        nodata=tuple(flags.nodata or ()),
+        crop=flags.crop,
+        cell=flags.cell if is_arrival else None,
+        time_column=flags.time_column,
+    )
+    sequences, begins, notes = list[NDArray[np.uint8]](), list[str | None](), list[str]()
     first: Place | None = None
-    for stack in stacks(flags.inputs, one_file_each=meaning.kind == "arrival"):
-        with closing(read(stack, choice)) as layers:
+    for stack in stacks(flags.inputs, one_file_each=is_arrival, order=flags.order):
+        notes += stack.notes
+        with closing(read(stack.files, choice)) as layers:
             fire = times(layers, meaning)
-        shape = target_shape(fire.place, height=flags.height, width=flags.width, cell=flags.cell)
-        place = of_world(fire.place, shape)
-        first = first or place
-        check_alike(place, fire.name, first, mixed=flags.mixed)
-        sequences.append(states(fire, shape, flags.resample))
+        first = first or fire.place
+        check_alike(fire.place, fire.name, first, mixed=flags.mixed)
+        sequences.append(states(fire))
         begins.append(fire.begin)
+        notes += [f"{fire.name}: {note}" for note in fire.notes]
     text = description(name, flags.step, begins).encode()
     description_file = flags.out.with_suffix(".toml")
     contents: dict[Path, Fill] = {
@@ -162,6 +176,8 @@ def _import(flags: argparse.Namespace) -> None:
         image = draw(sequences, name)
         contents[flags.picture] = lambda file: image.save(file, "PNG")
     write(contents)
+    for note in notes:
+        print(shown(note))
     for states_of_fire in sequences:
         print(_summary(states_of_fire))
     if first is not None and flags.cell is not None and first.ground() is None:
@@ -198,7 +214,11 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         begin=flags.begin,
         burning=flags.burning or 1,
         every=flags.every or 1,
-        crop=flags.crop,
+        year_days=flags.year_days,
+        height=flags.height,
+        width=flags.width,
+        cell=flags.cell,
+        resample=flags.resample,
         codes=flags.codes or (0, 1, 2),
         oblong=flags.oblong,
         missing_is_unburnt=flags.missing_is_unburnt,

@@ -32,7 +32,7 @@ def slopes(layer: Layer, *, cell: Side | None, height_unit: str | None, oblong: 
     (width, height), why = _sides(layer, cell, oblong=oblong)
     is_in_feet = _is_in_feet(layer, cell)
     metres, heights = _height_unit(layer, height_unit, is_in_feet=is_in_feet)
-    values = layer.values * metres
+    values = layer.values.astype(np.float64) * metres
     _check_heights(layer, values)
     rise = gradient(values, width, height)
     steepest = np.degrees(np.arctan(np.hypot(*rise).max()))

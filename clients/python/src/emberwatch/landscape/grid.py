@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,8 +214,8 @@ def target_shape(
 
 
 def resampled(
-    times: NDArray[np.float64], shape: tuple[int, int], rule: Rule, *, latest: bool = False
-) -> NDArray[np.float64]:
+    times: NDArray[np.floating[Any]], shape: tuple[int, int], rule: Rule, *, latest: bool = False
+) -> NDArray[np.floating[Any]]:
     """Resamples times to larger or smaller cells.
 
     With `"nearest"`, a cell gets the time of the input cell in its middle. With `"earliest"`, it

@@ -24,17 +24,6 @@ from emberwatch.landscape.terrain import model_text, slope_and_wind
 from emberwatch.landscape.world import Fill, check_new, write
 
 _NAME: Final = "python -m emberwatch.landscape land"
-_EXAMPLES: Final = """
-examples:
-  # Fire climbs slopes, and follows a wind of 5 m/s to the east-north-east:
-  python -m emberwatch.landscape land dem.tif --wind-speed 5 --wind-towards 20 --out hills.toml
-  # Heights in feet, and a wind from the west-south-west:
-  python -m emberwatch.landscape land dem.tif --height-unit ft --wind-speed 5 --wind-from WSW \\
-      --out hills.toml
-  # Fuels, of which 3 burns twice as well as others and 7 and 8 never, and no-fly cells over towns:
-  python -m emberwatch.landscape land --fuel fuel.tif --factors 3=2 --unburnable 7,8 \\
-      --no-fly towns.tif --out fuels.toml
-"""
 _MOST_NUMBER: Final = 10**15  # maximum class of fuel; doubles represent all integers up to it
 _MOST_FACTOR: Final = 1e6  # maximum factor of a map
 _MOST_WIND: Final = 100.0  # maximum wind speed, m/s: more than any hurricane
@@ -56,8 +45,6 @@ def _parser() -> argparse.ArgumentParser:
         description="Make a model file with maps from rasters: GeoTIFF (.tif), ESRI ASCII grid "
         "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/land.md describes the rules and "
         "the formula.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
     add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
@@ -233,6 +220,8 @@ def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:
     if missing:
         expected = f"classes that occur in {flags.fuel}"
         raise invalid("--factors and --unburnable", expected, min(missing))
+    is_named = np.isin(layer.values, list(table))
+    _check_codes(layer, is_named, "give --nodata if it means no value, or name it in --factors")
     factors = np.array([table.get(one, 1.0) for one in classes.tolist()])
     return factors[places].reshape(layer.place.shape)
 
@@ -257,6 +246,8 @@ def _files(
             raise invalid("--out", expected, f"{n_values} values in {len(content)} bytes")
         files["maps"] = flags.out.with_suffix(".npz"), lambda file: file.write(content)
     if no_fly is not None:
+        remedy = "give --nodata if it means no value"
+        _check_codes(no_fly, np.zeros(no_fly.values.shape, np.bool_), remedy)
         # Cells without a value are free, because rasters made from polygons have none outside them.
         cells = np.nan_to_num(no_fly.values, nan=0.0) != 0.0
         if cells.all():
@@ -275,8 +266,8 @@ def _no_fly_summary(layer: Layer) -> str:
 
 
 def _layer(file: Path, choice: Choice) -> Layer:
-    (files,) = stacks([file], one_file_each=False)
-    with closing(read(files, choice)) as layers:
+    (stack,) = stacks([file], one_file_each=False)
+    with closing(read(stack.files, choice)) as layers:
         found = list(islice(layers, 2))
     if len(found) != 1:
         raise invalid(file, "one layer", "several; choose with --band" if found else "none")
@@ -286,6 +277,13 @@ def _layer(file: Path, choice: Choice) -> Layer:
         most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum"
         raise invalid(layer.name, most, f"{height} x {width}")
     return layer
+
+
+def _check_codes(layer: Layer, is_named: NDArray[np.bool_], remedy: str) -> None:
+    """Refuses numbers below 0, which mostly mean "no value", unless a flag names them."""
+    wrong = layer.values[(layer.values < 0) & ~is_named]
+    if wrong.size:
+        raise invalid(layer.name, "numbers of at least 0", f"{wrong[0]:g}; {remedy}")
 
 
 def _whole(layer: Layer, missing_class: int | None) -> NDArray[np.int64]:

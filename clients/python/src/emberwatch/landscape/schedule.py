@@ -1,33 +1,27 @@
 """Times in files, such as `hours since 2020-08-01`, and the step that first shows each layer."""
 
 import math
-import re
-from datetime import UTC, datetime, timedelta, timezone
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.landscape.libraries import library
 
 SECONDS: Final = {
     "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9
 }  # fmt: skip
 """The length of each unit in seconds."""
 EVEN: Final = 1e-3
-"""Tolerance for times, as a share of a step, because 32-bit numbers are rounded."""
+"""Tolerance for times, as a share of a step, because decimal fractions are rounded."""
+SINCE_1970: Final = "seconds since 1970-01-01"
 
+_COARSE: Final = 0.1  # maximum distance between numbers that the file can store, share of a step
 _SPELLINGS: Final = {
     "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d",
     "msec": "ms", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns",
 }  # fmt: skip
-#: Calendars whose dates are Gregorian from the year `_GREGORIAN` on.
-_CALENDARS: Final = ("standard", "gregorian", "proleptic_gregorian")
-_GREGORIAN: Final = 1583  # the first year in which these calendars agree
-_DATE: Final = re.compile(
-    r"(\d{4})-(\d{1,2})-(\d{1,2})(?:[T ]+(\d{1,2})(?::(\d{1,2}))?(?::(\d{1,2})(?:\.\d*)?)?)?"
-    r"\s*(?:Z|UTC|GMT|([+-])(\d{1,2})(?::?(\d{2}))?)?"
-)
 
 
 class Clock(NamedTuple):
@@ -41,29 +35,26 @@ class Clock(NamedTuple):
         unit = _unit(self.words.partition(" since ")[0])
         return unit if unit in SECONDS else None
 
-    def date(self, seconds: float) -> datetime | None:
-        """Returns the date `seconds` after time 0; None if the date of time 0 is unknown."""
-        epoch = self.epoch()
+    def epoch(self) -> float | None:
+        """Returns time 0 in seconds since 1970 in the calendar; None if the file has no date."""
+        _, since, date = self.words.partition(" since ")
+        if not since:
+            return None
+        cftime = library("cftime", f"times in '{self.words}'")
         try:
-            return None if epoch is None else epoch + timedelta(seconds=seconds)
-        except OverflowError:  # beyond the year 9999
+            start = cftime.num2date(0, f"seconds since {date}", self.calendar)
+            return float(cftime.date2num(start, SINCE_1970, self.calendar))
+        except (OverflowError, ValueError):  # not a day of the calendar
             return None
 
-    def epoch(self) -> datetime | None:
-        """Returns the date of time 0; None if it is missing or in another calendar."""
-        parts = _DATE.fullmatch(self.words.partition(" since ")[2].strip())
-        if parts is None or self.calendar.lower() not in _CALENDARS:
+    def date(self, seconds: float) -> str | None:
+        """Returns the date `seconds` after time 0; None if the date of time 0 is unknown."""
+        epoch = self.epoch()
+        if epoch is None:
             return None
-        *digits, sign, hours, minutes = parts.groups(default="0")
-        numbers = [int(part) for part in digits]
-        if numbers[0] < _GREGORIAN:
-            return None
-        try:
-            ahead = timedelta(hours=int(hours), minutes=int(minutes))
-            zone = timezone(-ahead if sign == "-" else ahead)
-            return datetime(*numbers, tzinfo=zone).astimezone(UTC)
-        except (OverflowError, ValueError):  # not a day, or outside the years 1 to 9999
-            return None
+        date = library("cftime", "times").num2date(epoch + seconds, SINCE_1970, self.calendar)
+        words = "" if self.calendar == "standard" else f" ({self.calendar} calendar)"
+        return f"{date:%Y-%m-%d %H:%M:%S} UTC{words}"
 
 
 class Time(NamedTuple):
@@ -71,84 +62,58 @@ class Time(NamedTuple):
 
     value: float
     clock: Clock
+    rounding: float = 0.0
+    """Distance to the next number that the file can store."""
 
 
-class Schedule:
-    """The times of the layers of one fire, in order."""
+class Schedule(NamedTuple):
+    """The steps of the layers of one fire."""
 
-    def __init__(self, *, step: float, every: int, unit: str | None) -> None:
-        """Starts without layers. `step` is in seconds; `unit` is the unit, None for the file's."""
-        self._step, self._every, self._wanted = step, every, unit
-        self._first_name, self._clock = "", None
-        self._unit: str | None = None
-        self._last_time = ""
-        self._times = list[float]()
-        self.begin: datetime | None = None
-        """The date of step 0, if the files have it."""
+    steps: NDArray[np.float64]
+    """The first step that shows each layer."""
+    begin: str | None
+    """The date of step 0, if the files have it."""
 
-    def add(self, name: str, time: Time | None) -> None:
-        """Adds a layer; refuses one that is not later than the previous layers."""
-        unit = None if time is None else unit_of(time.clock, self._wanted, name)
-        clock = None if time is None else time.clock
-        if not self._times:
-            self._first_name, self._clock, self._unit = name, clock, unit
-            self._check_flags()
-        elif clock != self._clock:
-            self._check_clock(name, clock)
-        if time is None:
-            self._times.append(len(self._times))
-            return
-        seconds = time.value * SECONDS.get(unit or "", 1.0)
-        date = None if unit is None else time.clock.date(seconds)
-        self._times.append(seconds if date is None else date.timestamp())
-        if len(self._times) == 1:
-            self.begin = date
-        shown_time = str(date or f"{time.value:.6g}")
-        self._check_order(name, shown_time)
-        self._last_time = shown_time
 
-    def steps(self) -> tuple[NDArray[np.float64], int]:
-        """Returns the first step that shows each layer, and the number of steps."""
-        if self._unit is None:
-            after, step = np.arange(len(self._times), dtype=np.float64), self._every
-        else:
-            after, step = np.array(self._times) - self._times[0], self._step
-        steps = steps_at(after, step)
-        return steps, int(steps[-1]) + 1
+def schedule(
+    names: list[str], times: list[Time | None], *, step: float, every: int, unit: str | None
+) -> Schedule:
+    """Computes the steps of layers, by their times if they have any, otherwise by their numbers.
 
-    def _check_flags(self) -> None:
-        if self._unit is not None and self._every != 1:
+    `step` is in seconds. `unit` is the unit of the times; None for the files' unit. Refuses layers
+    that are not in order.
+    """
+    first = times[0]
+    for name, time in zip(names, times, strict=True):
+        _check_clock(name, time, names[0], first)
+    in_layers = np.arange(len(times)) / every
+    if first is None:
+        if unit is not None:
             raise InvalidArgumentError(
-                f"--every: applies only to layers without times, got --every {self._every}: "
-                f"{self._first_name} has the time of each layer, and --step chooses among them"
+                f"--unit: {names[0]} has no times, got --unit {unit}; leave the flag out"
             )
-        if self._clock is None and self._wanted is not None:
-            raise InvalidArgumentError(
-                f"--unit: {self._first_name} has no times, got --unit {self._wanted}; leave the "
-                "flag out"
-            )
-
-    def _check_clock(self, name: str, clock: Clock | None) -> None:
-        """Refuses times that cannot be compared with the first layer's time."""
-        both = clock, self._clock
-        if any(one is None or one.unit() is None or one.epoch() is None for one in both):
-            first, got = (
-                "no time" if one is None else f"times in '{one.words}' ({one.calendar})"
-                for one in (self._clock, clock)
-            )
-            raise invalid(name, f"{first} as in {self._first_name}", got)
-
-    def _check_order(self, name: str, shown_time: str) -> None:
-        if len(self._times) < 2:
-            return
-        step, first = self._times[-1] - self._times[-2], self._times[1] - self._times[0]
-        if step <= 0:
-            raise invalid(name, f"a later time than {self._last_time}", shown_time)
-        if self._unit is None and abs(step - first) > EVEN * first:
-            raise InvalidArgumentError(
-                f"{name}: expected times {first:.6g} apart, like the first ones, got {step:.6g}; "
-                "to allow this, give the unit of times with --unit"
-            )
+        return Schedule(steps_at(in_layers, 1.0), None)
+    stated = [
+        unit_of(time.clock, unit, name) for name, time in zip(names, times, strict=True) if time
+    ]
+    seconds = np.array(
+        [
+            time.value * SECONDS[each or "s"] + (time.clock.epoch() or 0.0 if each else 0.0)
+            for time, each in zip(times, stated, strict=True)
+            if time
+        ]
+    )
+    begin = None if stated[0] is None else first.clock.date(first.value * SECONDS[stated[0]])
+    _check_order(names, times, seconds, is_in_unit=stated[0] is not None)
+    if stated[0] is None:
+        return Schedule(steps_at(in_layers, 1.0), None)
+    if every != 1:
+        raise InvalidArgumentError(
+            f"--every: applies only to layers without times, got --every {every}: {names[0]} has "
+            "the time of each layer, and --step chooses among them"
+        )
+    rounding = max(time.rounding for time in times if time) * SECONDS[stated[0]]
+    return Schedule(steps_at(seconds - seconds[0], step, rounding, names[0]), begin)
 
 
 def length(text: str) -> float:
@@ -163,10 +128,22 @@ def length(text: str) -> float:
     return seconds
 
 
-def steps_at(times: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Returns the first step at or after each time, from 0; infinite times stay infinite."""
+def steps_at(
+    times: NDArray[np.floating[Any]], step: float, rounding: float = 0.0, name: str = ""
+) -> NDArray[np.float64]:
+    """Returns the first step at or after each time, from 0; infinite times stay infinite.
+
+    `rounding` is the distance between numbers that the file `name` can store.
+    """
+    if rounding > _COARSE * step:
+        raise invalid(
+            name,
+            f"times stored to a tenth of a --step, {_COARSE * step:.6g} s",
+            f"floating-point numbers {rounding:.6g} s apart; store times in double precision, or "
+            "count them from a later date",
+        )
     with np.errstate(over="ignore"):
-        steps = np.ceil(times / step - EVEN)
+        steps = np.ceil(times / step - max(EVEN, rounding / step))
     if (np.isinf(steps) & np.isfinite(times)).any():
         raise InvalidArgumentError(
             f"--step: too short for times up to {times[np.isfinite(times)].max():.6g}, got "
@@ -177,13 +154,53 @@ def steps_at(times: NDArray[np.float64], step: float) -> NDArray[np.float64]:
 
 def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
     """Returns the unit of times from the flag or the file; refuses two different units."""
-    in_file = clock.unit()
+    in_file, words = clock.unit(), clock.words.strip()
+    if "%" in words:
+        raise invalid(name, "times in a unit, or 'day as %Y%m%d.%f'", f"'{words}'")
     if None not in (wanted, in_file) and wanted != in_file:
         raise invalid("--unit", f"{in_file}, as in {name}", wanted)
-    if wanted is None and in_file is None and clock.words.strip() not in ("", "1"):
-        got = f"'{clock.words}'; give the unit with --unit"
-        raise invalid(name, "times in days or smaller units", got)
+    if wanted is None and in_file is None and words not in ("", "1"):
+        raise invalid(
+            name, "times in days or smaller units", f"'{words}'; give the unit with --unit"
+        )
     return wanted or in_file
+
+
+def _check_clock(name: str, time: Time | None, first_name: str, first: Time | None) -> None:
+    """Refuses a time that cannot be compared with the first layer's time."""
+    clocks = [each and each.clock for each in (first, time)]
+    if clocks[0] == clocks[1]:
+        return
+    both = [each for each in clocks if each and each.unit() and each.epoch() is not None]
+    if len(both) < 2 or both[0].calendar != both[1].calendar:
+        expected, got = (
+            "no time" if each is None else f"times in '{each.words}' ({each.calendar})"
+            for each in clocks
+        )
+        raise invalid(name, f"{expected} as in {first_name}", got)
+
+
+def _check_order(
+    names: list[str], times: list[Time | None], seconds: NDArray[np.float64], *, is_in_unit: bool
+) -> None:
+    """Refuses times that do not increase, or that are uneven and have no unit."""
+    gaps = np.diff(seconds)
+    for k, gap in enumerate(gaps.tolist(), start=1):
+        if gap <= 0:
+            before, got = (_shown(times[i], is_in_unit=is_in_unit) for i in (k - 1, k))
+            raise invalid(names[k], f"a later time than {before}", got)
+        if not is_in_unit and abs(gap - gaps[0]) > EVEN * gaps[0]:
+            raise InvalidArgumentError(
+                f"{names[k]}: expected times {gaps[0]:.6g} apart, like the first ones, got "
+                f"{gap:.6g}; to allow this, give the unit of times with --unit"
+            )
+
+
+def _shown(time: Time | None, *, is_in_unit: bool) -> str:
+    if time is None:
+        return "none"
+    unit = SECONDS[time.clock.unit() or "s"]
+    return (time.clock.date(time.value * unit) if is_in_unit else None) or f"{time.value:.6g}"
 
 
 def _unit(text: str) -> str:
