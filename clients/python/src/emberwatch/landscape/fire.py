@@ -8,7 +8,7 @@ state of each cell in each step.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,21 @@ from emberwatch.landscape.grid import (
     target_shape,
 )
 from emberwatch.landscape.layers import Layer
-from emberwatch.landscape.schedule import SECONDS, Time, schedule, steps_at, unit_of
+from emberwatch.landscape.schedule import (
+    SECONDS,
+    Time,
+    check_timed,
+    schedule,
+    steps_at,
+    unit_of,
+    without_times,
+)
 from emberwatch.landscape.world import STATES
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 
 Kind = Literal["arrival", "mask", "burning", "states"]
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 
 #: Parts of words that identify each state, in the order of the search.
 _WORDS: Final = (("not_burn", "unburn"), ("burning",), ("burned", "burnt"))
@@ -40,8 +49,7 @@ _LEAST: Final = -1e18
 _LAST_DAY, _HALF_YEAR = 366, 180  # days
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Times:
+class Times(NamedTuple):
     """The times at which each cell of one fire begins to burn, and is burnt, on the world's grid.
 
     Times are in steps, and infinite if the cell never begins to burn or never is burnt.
@@ -64,8 +72,8 @@ class Meaning:
     """The interpretation of the numbers in the layers, from the flags."""
 
     kind: Kind
-    step: float
-    """Duration of a step, seconds."""
+    seconds: float
+    """Duration of a step."""
     unit: str | None = None
     """Unit of arrival times, or of the times of layers; None: the file's unit."""
     begin: float | None = None
@@ -99,6 +107,8 @@ def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
 def states(fire: Times) -> NDArray[np.uint8]:
     """Computes the states of a fire in each step, shape (K, H, W)."""
     height, width = fire.place.shape
+    if fire.n_steps < 2:
+        raise invalid(fire.name, "at least 2 steps", fire.n_steps)
     if fire.n_steps * height * width > MOST_STATES:
         raise InvalidArgumentError(
             f"{fire.name}: expected at most {MOST_STATES} bytes of states, got "
@@ -115,7 +125,6 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     layer = layers[0]
     if len(layers) != 1:
         raise invalid(layer.name, "one band of arrival times", f"{len(layers)}; choose with --band")
-    _check_square(layer, meaning)
     arrival = layer.values
     burns = np.isfinite(arrival)
     arrival[~burns] = np.inf
@@ -124,30 +133,26 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
         raise invalid(layer.name, "cells that burn", "none")
     unit = unit_of(layer.clock, meaning.unit, layer.name)
     if unit is None:
-        raise invalid(
-            "--unit", f"s, min, h or d, as {layer.name} does not state the unit of times", "none"
-        )
+        expected = f"s, min, h or d, as {layer.name} does not state the unit of times"
+        raise invalid("--unit", expected, "none")
     notes = layer.notes + _over_new_year(arrival, unit, layer.name, meaning)
     latest = np.max(arrival, where=burns, initial=-np.inf)
     begin = float(arrival.min()) if meaning.begin is None else meaning.begin
     rounding = float(np.spacing(np.array(latest, layer.stored))) if layer.stored.kind == "f" else 0
-    first, last = _resampled(arrival, arrival, layer, meaning)
-
-    def steps(at: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        # A step shows the fire at the step's time, so a cell that begins to burn later first burns
-        # in the next step.
-        after = np.maximum(at.astype(np.float64), begin) - begin
-        return steps_at(after, meaning.step / SECONDS[unit], rounding, layer.name)
-
-    return _checked(
-        steps(first),
-        steps(last) + meaning.burning,
-        int(steps(np.array([latest]))[0]) + 1,
-        layer,
-        meaning,
-        begin=layer.clock.date(begin * SECONDS[unit]),
-        notes=notes,
+    place, first, last = _on_world(arrival, arrival, layer, meaning)
+    # A step shows the fire at the step's time, so a cell that begins to burn later first burns in
+    # the next step.
+    first, last, latest = (
+        steps_at(
+            np.maximum(np.asarray(at, np.float64), begin) - begin,
+            meaning.seconds / SECONDS[unit],
+            rounding,
+            layer.name,
+        )
+        for at in (first, last, latest)
     )
+    date = layer.clock.date(begin * SECONDS[unit])
+    return Times(first, last + meaning.burning, int(latest) + 1, place, layer.name, date, notes)
 
 
 def _check_negative(layer: Layer, meaning: Meaning) -> None:
@@ -191,103 +196,107 @@ def _over_new_year(
 
 def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
     first = None
+    state, mark = np.empty(0, np.uint8), math.nan
     arrival = burnt = np.empty(0, np.float32)  # numbers of layers
-    names, stamps, mark = list[str](), list[Time | None](), math.nan
+    names, stamps = list[str](), list[Time]()
     for k, layer in enumerate(layers):
         if first is None:
-            first = layer
-            _check_square(layer, meaning)
-            arrival, burnt = np.full((2, *layer.place.shape), np.inf, np.float32)
+            first, state = layer, np.zeros(layer.place.shape, np.uint8)
+            arrival, burnt = np.full((2, *state.shape), np.inf, np.float32)
         check_same(layer.place, layer.name, first.place, first.name)
         names.append(layer.name)
-        stamps.append(layer.time)
-        mark = _add(layer, k, meaning, arrival, burnt, mark)
+        stamps += [layer.time] if layer.time else []
+        _fill_missing(layer, meaning)
+        _check_flags(layer, meaning)
+        if meaning.kind == "states":
+            now = _coded(layer, meaning)
+        else:
+            now, mark = _marked(layer, meaning, state, mark)
+        _check_order(layer, state, now)
+        state = now
+        arrival[(state >= BURNING) & np.isinf(arrival)] = k
+        burnt[(state == BURNT) & np.isinf(burnt)] = k
     if first is None:
         raise invalid("layers", "at least 2", "none")
-    times = schedule(names, stamps, step=meaning.step, every=meaning.every, unit=meaning.unit)
+    check_timed(names, stamps)
+    if stamps:
+        times = schedule(stamps, step=meaning.seconds, every=meaning.every, unit=meaning.unit)
+    elif meaning.unit is None:
+        times = without_times(len(names), meaning.every)
+    else:
+        got = f"--unit {meaning.unit}; leave the flag out"
+        raise InvalidArgumentError(f"--unit: {names[0]} has no times, got {got}")
     if np.isinf(arrival).all():
         raise invalid(first.name, "cells that burn", "none")
-    last = arrival if meaning.kind == "mask" else burnt
-    arrival, burnt = (_at(at, times.steps) for at in _resampled(arrival, last, first, meaning))
-    return _checked(
-        arrival,
-        burnt + meaning.burning if meaning.kind == "mask" else burnt,
-        int(times.steps[-1]) + 1,
-        first,
-        meaning,
-        begin=times.begin,
-    )
+    is_mask = meaning.kind == "mask"
+    place, *both = _on_world(arrival, arrival if is_mask else burnt, first, meaning)
+    arrival, burnt = (_at(one, times.steps) for one in both)
+    n_steps = int(times.steps[-1]) + 1
+    burnt = burnt + meaning.burning if is_mask else burnt
+    return Times(arrival, burnt, n_steps, place, first.name, times.begin)
 
 
-def _resampled(
+def _on_world(
     arrival: NDArray[Any], burnt: NDArray[Any], layer: Layer, meaning: Meaning
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Resamples both times of each cell to the world's grid."""
-    shape = _world(layer, meaning).shape
-    if shape == arrival.shape:
-        return arrival, burnt
-    # A larger cell is burnt once all of its input cells that ever burn are burnt.
-    burns = np.isfinite(arrival)
-    last = resampled(np.where(burns, burnt, -np.inf), shape, meaning.resample, latest=True)
-    first = resampled(arrival, shape, meaning.resample)
-    if not np.isfinite(first).any():
-        raise InvalidArgumentError(
-            f"--resample: no cell burns on the grid of {shape[0]} x {shape[1]} cells; use "
-            "'earliest'"
-        )
-    return first, np.where(np.isfinite(first), last, np.inf)
-
-
-def _world(layer: Layer, meaning: Meaning) -> Place:
+) -> tuple[Place, NDArray[Any], NDArray[Any]]:
+    """Returns the world's grid, and both times of each cell resampled to it."""
+    if not meaning.oblong:
+        check_square(layer.place, layer.name)
     height, width, cell = meaning.height, meaning.width, meaning.cell
     shape = target_shape(layer.place, height=height, width=width, cell=cell)
-    return of_world(layer.place, shape)
+    place = of_world(layer.place, shape)
+    if shape == arrival.shape:
+        return place, arrival, burnt
+    # A larger cell is burnt once all of its input cells that ever burn are burnt.
+    last = np.where(np.isfinite(arrival), burnt, -np.inf)
+    last = resampled(last, shape, meaning.resample, latest=True)
+    first = resampled(arrival, shape, meaning.resample)
+    burns = np.isfinite(first)
+    if not burns.any():
+        grid = f"the grid of {shape[0]} x {shape[1]} cells"
+        raise InvalidArgumentError(f"--resample: no cell burns on {grid}; use 'earliest'")
+    return place, first, np.where(burns, last, np.inf)
 
 
-def _add(
-    layer: Layer,
-    k: int,
-    meaning: Meaning,
-    arrival: NDArray[np.float32],
-    burnt: NDArray[np.float32],
-    mark: float,
-) -> float:
-    """Updates the times with layer k; returns the number that marks the cells of a mask."""
-    values = layer.values
-    missing = np.isnan(values)
-    if missing.any():
-        if not meaning.missing_is_unburnt:
-            raise InvalidArgumentError(
-                f"{layer.name}: expected a value in each cell, got none in {missing.sum()} cells, "
-                f"the first {_cell(missing)}; --missing-is-unburnt treats them as unburnt"
-            )
-        values[missing] = meaning.codes[0] if meaning.kind == "states" else 0.0
-    _check_flags(layer, meaning)
-    if meaning.kind == "states":
-        unburnt, burning, done = (values == code for code in meaning.codes)
-        known = unburnt | burning | done
-        if not known.all():
-            raise invalid(layer.name, f"the codes {_numbers(meaning.codes)}", _first(layer, ~known))
-    else:
-        unburnt, done = values == 0, np.zeros(values.shape, bool)
-        if math.isnan(mark) and not unburnt.all():
-            mark = float(values[~unburnt][0])
-        if mark < 0:
-            got = f"{_first(layer, ~unburnt)}; if it means no value, give --nodata"
-            raise invalid(layer.name, "0 and a number above 0", got)
-        burning = values == mark
-        if not (unburnt | burning).all():
-            raise InvalidArgumentError(
-                f"{layer.name}: expected 0 and only one other number in all layers, {mark:.6g}, "
-                f"got {_first(layer, ~(unburnt | burning))}"
-            )
-        if meaning.kind == "burning":
-            done = unburnt & np.isfinite(arrival)
-            unburnt &= ~done
-    _check_order(layer, unburnt, burning, arrival, burnt)
-    arrival[(burning | done) & np.isinf(arrival)] = k
-    burnt[done & np.isinf(burnt)] = k
-    return mark
+def _fill_missing(layer: Layer, meaning: Meaning) -> None:
+    missing = np.isnan(layer.values)
+    if missing.any() and not meaning.missing_is_unburnt:
+        remedy = "--missing-is-unburnt treats them as unburnt"
+        got = f"none in {missing.sum()} cells, the first {_cell(missing)}; {remedy}"
+        raise invalid(layer.name, "a value in each cell", got)
+    layer.values[missing] = meaning.codes[0] if meaning.kind == "states" else 0.0
+
+
+def _coded(layer: Layer, meaning: Meaning) -> NDArray[np.uint8]:
+    """Returns the states that codes mean."""
+    now = np.full(layer.values.shape, len(meaning.codes), np.uint8)
+    for state, code in enumerate(meaning.codes):
+        now[layer.values == code] = state
+    unknown = now == len(meaning.codes)
+    if unknown.any():
+        codes = ", ".join(f"{code:.6g}" for code in meaning.codes)
+        raise invalid(layer.name, f"the codes {codes}", _first(layer, unknown))
+    return now
+
+
+def _marked(
+    layer: Layer, meaning: Meaning, before: NDArray[np.uint8], mark: float
+) -> tuple[NDArray[np.uint8], float]:
+    """Returns the states that a mask means, and the number that marks its cells."""
+    burning = layer.values != 0
+    if math.isnan(mark) and burning.any():
+        mark = float(layer.values[burning][0])
+    if mark < 0:
+        got = f"{_first(layer, burning)}; if it means no value, give --nodata"
+        raise invalid(layer.name, "0 and a number above 0", got)
+    wrong = burning & (layer.values != mark)
+    if wrong.any():
+        expected = f"0 and only one other number in all layers, {mark:.6g}"
+        raise InvalidArgumentError(f"{layer.name}: expected {expected}, got {_first(layer, wrong)}")
+    now = burning.astype(np.uint8)
+    if meaning.kind == "burning":
+        now[~burning & (before >= BURNING)] = BURNT
+    return now, mark
 
 
 def _check_flags(layer: Layer, meaning: Meaning) -> None:
@@ -308,46 +317,16 @@ def _check_flags(layer: Layer, meaning: Meaning) -> None:
             )
 
 
-def _check_order(
-    layer: Layer,
-    unburnt: NDArray[np.bool_],
-    burning: NDArray[np.bool_],
-    arrival: NDArray[np.float32],
-    burnt: NDArray[np.float32],
-) -> None:
-    """Refuses states that cannot follow the previous layers."""
-    for wrong, words in (
-        (burning & np.isfinite(burnt), "burnt cells to stay burnt, got {} that burn again"),
-        (
-            unburnt & np.isfinite(arrival),
-            "burning cells not to become unburnt, got {} that are unburnt again",
-        ),
+def _check_order(layer: Layer, before: NDArray[np.uint8], now: NDArray[np.uint8]) -> None:
+    """Refuses states that cannot follow those of the previous layer."""
+    for state, words in (
+        (BURNING, "burnt cells to stay burnt, got {} that burn again"),
+        (UNBURNT, "burning cells not to become unburnt, got {} that are unburnt again"),
     ):
+        wrong = (now == state) & (before > state)
         if wrong.any():
-            expected = words.format(wrong.sum())
-            where = f"the first {_cell(wrong)}"
-            raise InvalidArgumentError(f"{layer.name}: expected {expected}, {where}")
-
-
-def _check_square(layer: Layer, meaning: Meaning) -> None:
-    if not meaning.oblong:
-        check_square(layer.place, layer.name)
-
-
-def _checked(
-    arrival: NDArray[np.float64],
-    burnt: NDArray[np.float64],
-    n_steps: int,
-    layer: Layer,
-    meaning: Meaning,
-    **more: Any,
-) -> Times:
-    if n_steps < 2:
-        raise invalid(layer.name, "at least 2 steps", n_steps)
-    place = _world(layer, meaning)
-    return Times(
-        arrival=arrival, burnt=burnt, n_steps=n_steps, place=place, name=layer.name, **more
-    )
+            words = words.format(wrong.sum())
+            raise InvalidArgumentError(f"{layer.name}: expected {words}, the first {_cell(wrong)}")
 
 
 def _at(layers: NDArray[np.floating[Any]], steps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -363,7 +342,3 @@ def _cell(cells: NDArray[np.bool_]) -> str:
 
 def _first(layer: Layer, cells: NDArray[np.bool_]) -> str:
     return f"{layer.values[cells][0]:.9g} {_cell(cells)}"
-
-
-def _numbers(numbers: Iterable[float]) -> str:
-    return ", ".join(f"{number:.6g}" for number in numbers)

@@ -16,6 +16,7 @@ from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.compass import POINTS, bearing
 from emberwatch.landscape.elevation import slopes
+from emberwatch.landscape.flags import add_common, several
 from emberwatch.landscape.grid import check_same
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice, Layer
@@ -27,6 +28,7 @@ _NAME: Final = "python -m emberwatch.landscape land"
 _MOST_NUMBER: Final = 10**15  # maximum class of fuel; doubles represent all integers up to it
 _MOST_FACTOR: Final = 1e6  # maximum factor of a map
 _MOST_WIND: Final = 100.0  # maximum wind speed, m/s: more than any hurricane
+_CLASSES: Final = several(int, "whole numbers", bool)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -42,69 +44,23 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a model file with maps from rasters: GeoTIFF (.tif), ESRI ASCII grid "
-        "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/land.md describes the rules and "
-        "the formula.",
+        description="Make a model file with maps from rasters. docs/land.md describes the flags.",
     )
     add = parser.add_argument
     add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE.toml",
-        help="the model file; its maps go to FILE.npz",
-    )
-    add(
-        "--cell",
-        metavar="METRES",
-        help="side of a cell on the ground, if the raster does not state it; '98.4 ft' for feet",
-    )
-    add(
-        "--height-unit",
-        choices=tuple(METRES),
-        help="unit of the heights [the raster's, or m]",
-    )
+    add("--out", type=Path, required=True, metavar="FILE.toml", help="its maps go to FILE.npz")
+    add("--cell", metavar="METRES", help="side of a cell, if the raster does not state it")
+    add("--height-unit", choices=tuple(METRES), help="unit of the heights [the raster's, or m]")
     add("--oblong", action="store_true", help="allow cells that are not square or differ in size")
     add("--wind-speed", type=float, default=0.0, metavar="M/S", help="speed of the wind [0]")
-    add(
-        "--wind-towards",
-        type=float,
-        metavar="DEGREES",
-        help="direction to which the wind blows, in degrees from the east towards the north: 0 is "
-        "to the east, 90 to the north",
-    )
-    add(
-        "--wind-from",
-        metavar="POINT|DEGREES",
-        help="instead of --wind-towards: where the wind comes from, as in weather reports: N, "
-        "NNE, ..., or degrees clockwise from the north",
-    )
+    add("--wind-towards", type=float, metavar="DEGREES", help="0 is to the east, 90 to the north")
+    add("--wind-from", metavar="POINT|DEGREES", help="instead, as in weather reports, such as NNE")
     add("--fuel", type=Path, metavar="RASTER", help="whole numbers, each a class of fuel")
-    add(
-        "--factors",
-        type=_factors,
-        metavar="N=X,N=X",
-        help="factors by which classes of --fuel multiply the hazard of fire [1]",
-    )
-    add("--unburnable", type=_classes, metavar="N,N", help="classes of --fuel that never burn")
-    add(
-        "--missing-class",
-        type=int,
-        metavar="N",
-        help="class of the cells that have no value in --fuel",
-    )
-    add(
-        "--no-fly",
-        type=Path,
-        metavar="RASTER",
-        help="cells with a number other than 0 are no-fly cells",
-    )
-    add("--variable", metavar="NAME", help="the variable, if a NetCDF or .npz file has several")
-    add("--band", type=int, metavar="N", help="the band, if a raster has several")
-    add("--nodata", type=float, action="append", metavar="X", help="a number that means no value")
-    add("--name", help="name of the model [the output file's]")
-    add("--force", action="store_true", help="replace the output")
+    add("--factors", type=_factors, metavar="N=X,N=X", help="factors of the hazard of classes [1]")
+    add("--unburnable", type=_CLASSES, metavar="N,N", help="classes of --fuel that never burn")
+    add("--missing-class", type=int, metavar="N", help="class of cells without a value in --fuel")
+    add("--no-fly", type=Path, metavar="RASTER", help="a number other than 0 is a no-fly cell")
+    add_common(parser)
     return parser
 
 
@@ -305,13 +261,6 @@ def _origin(flags: argparse.Namespace, layers: dict[str, Layer]) -> str:
     files = ", ".join(ascii(getattr(flags, key).name) for key in layers)
     wind = f"{flags.wind_speed:g} m/s towards {flags.wind_towards:g} degrees"
     return f"{_NAME}: {files}; wind of {wind}"
-
-
-def _classes(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected whole numbers, got {text}") from None
 
 
 def _factors(text: str) -> dict[int, float]:

@@ -82,8 +82,9 @@ def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
     meanings = str(array.attrs.get("flag_meanings", "")).split()
     for band in choose_bands(file, len(array), choice):
         name = f"{file}, band {band}" if len(array) > 1 else str(file)
-        if times and not math.isfinite(times[band - 1].value):
-            raise invalid(name, "a time", times[band - 1].value)
+        time = times[band - 1]._replace(name=name) if times else None
+        if time is not None and not math.isfinite(time.value):
+            raise invalid(name, "a time", time.value)
         values, cut = window(name, array[band - 1][turned], place, choice)
         values[(values < low) | (values > high)] = np.nan
         yield Layer(
@@ -93,7 +94,7 @@ def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
             clock=_clock(array),
             stored=array.encoding["dtype"],
             flags=tuple(zip(flags.tolist(), meanings, strict=False)),
-            time=times[band - 1] if times else None,
+            time=time,
         )
 
 
@@ -282,7 +283,7 @@ def _times(file: Path, array: Any, dimension: str | None) -> list[Time]:
     if re.fullmatch(r"days? as %Y%m%d(\.%f)?", clock.words):
         numbers, gap = _seconds(f"{file}, {time.name}", numbers), gap * SECONDS["d"]
         clock = Clock(SINCE_1970)
-    return [Time(number, clock, gap) for number in numbers.tolist()]
+    return [Time(str(file), number, clock, gap) for number in numbers.tolist()]
 
 
 def _seconds(name: str, numbers: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,10 +13,9 @@ SECONDS: Final = {
     "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9
 }  # fmt: skip
 """The length of each unit in seconds."""
-EVEN: Final = 1e-3
-"""Tolerance for times, as a share of a step, because decimal fractions are rounded."""
 SINCE_1970: Final = "seconds since 1970-01-01"
 
+_EVEN: Final = 1e-3  # tolerance for times, share of a step, because decimal fractions are rounded
 _COARSE: Final = 0.1  # maximum distance between numbers that the file can store, share of a step
 _SPELLINGS: Final = {
     "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d",
@@ -60,6 +59,8 @@ class Clock(NamedTuple):
 class Time(NamedTuple):
     """The time of a layer."""
 
+    name: str
+    """The layer, for errors."""
     value: float
     clock: Clock
     rounding: float = 0.0
@@ -71,49 +72,55 @@ class Schedule(NamedTuple):
 
     steps: NDArray[np.float64]
     """The first step that shows each layer."""
-    begin: str | None
+    begin: str | None = None
     """The date of step 0, if the files have it."""
 
 
-def schedule(
-    names: list[str], times: list[Time | None], *, step: float, every: int, unit: str | None
-) -> Schedule:
-    """Computes the steps of layers, by their times if they have any, otherwise by their numbers.
+def schedule(times: list[Time], *, step: float, every: int, unit: str | None) -> Schedule:
+    """Computes the steps of layers, whose times must increase.
 
-    `step` is in seconds. `unit` is the unit of the times; None for the files' unit. Refuses layers
-    that are not in order.
+    `step` is in seconds. `unit` is the unit of the times; None for the files' unit. Layers without
+    a unit of times are evenly spaced, and make a step of `every` layers.
     """
     first = times[0]
-    for name, time in zip(names, times, strict=True):
-        _check_clock(name, time, names[0], first)
-    in_layers = np.arange(len(times)) / every
-    if first is None:
-        if unit is not None:
-            raise InvalidArgumentError(
-                f"--unit: {names[0]} has no times, got --unit {unit}; leave the flag out"
-            )
-        return Schedule(steps_at(in_layers, 1.0), None)
-    stated = [
-        unit_of(time.clock, unit, name) for name, time in zip(names, times, strict=True) if time
-    ]
+    for time in times:
+        _check_clock(time.name, time.clock, first.name, first.clock)
+    stated = [unit_of(time.clock, unit, time.name) for time in times]
+    lengths = [SECONDS[each or "s"] for each in stated]
     seconds = np.array(
         [
-            time.value * SECONDS[each or "s"] + (time.clock.epoch() or 0.0 if each else 0.0)
-            for time, each in zip(times, stated, strict=True)
-            if time
+            time.value * length + (time.clock.epoch() or 0.0)
+            for time, length in zip(times, lengths, strict=True)
         ]
     )
-    begin = None if stated[0] is None else first.clock.date(first.value * SECONDS[stated[0]])
-    _check_order(names, times, seconds, is_in_unit=stated[0] is not None)
+    for k, gap in enumerate(np.diff(seconds).tolist(), start=1):
+        even = seconds[1] - seconds[0]
+        if gap <= 0:
+            before, got = (
+                each.clock.date(each.value * length) or f"{each.value:.6g}"
+                for each, length in zip(times[k - 1 : k + 1], lengths[k - 1 : k + 1], strict=True)
+            )
+            raise invalid(times[k].name, f"a later time than {before}", got)
+        if stated[0] is None and abs(gap - even) > _EVEN * even:
+            raise InvalidArgumentError(
+                f"{times[k].name}: expected times {even:.6g} apart, like the first ones, got "
+                f"{gap:.6g}; to allow this, give the unit of times with --unit"
+            )
     if stated[0] is None:
-        return Schedule(steps_at(in_layers, 1.0), None)
+        return without_times(len(times), every)
     if every != 1:
         raise InvalidArgumentError(
-            f"--every: applies only to layers without times, got --every {every}: {names[0]} has "
+            f"--every: applies only to layers without times, got --every {every}: {first.name} has "
             "the time of each layer, and --step chooses among them"
         )
-    rounding = max(time.rounding for time in times if time) * SECONDS[stated[0]]
-    return Schedule(steps_at(seconds - seconds[0], step, rounding, names[0]), begin)
+    rounding = max(time.rounding for time in times) * lengths[0]
+    steps = steps_at(seconds - seconds[0], step, rounding, first.name)
+    return Schedule(steps, first.clock.date(first.value * lengths[0]))
+
+
+def without_times(n_layers: int, every: int) -> Schedule:
+    """Returns the steps of layers of which `every` make a step, which shows the last of them."""
+    return Schedule(steps_at(np.arange(n_layers), every))
 
 
 def length(text: str) -> float:
@@ -129,26 +136,21 @@ def length(text: str) -> float:
 
 
 def steps_at(
-    times: NDArray[np.floating[Any]], step: float, rounding: float = 0.0, name: str = ""
+    times: NDArray[Any], step: float, rounding: float = 0.0, name: str = ""
 ) -> NDArray[np.float64]:
     """Returns the first step at or after each time, from 0; infinite times stay infinite.
 
     `rounding` is the distance between numbers that the file `name` can store.
     """
     if rounding > _COARSE * step:
-        raise invalid(
-            name,
-            f"times stored to a tenth of a --step, {_COARSE * step:.6g} s",
-            f"floating-point numbers {rounding:.6g} s apart; store times in double precision, or "
-            "count them from a later date",
-        )
+        expected = f"times stored to a tenth of a --step, {_COARSE * step:.6g}"
+        remedy = "store times in double precision, or count them from a later date"
+        raise invalid(name, expected, f"floating-point numbers {rounding:.6g} apart; {remedy}")
     with np.errstate(over="ignore"):
-        steps = np.ceil(times / step - max(EVEN, rounding / step))
+        steps = np.ceil(times / step - max(_EVEN, rounding / step))
     if (np.isinf(steps) & np.isfinite(times)).any():
-        raise InvalidArgumentError(
-            f"--step: too short for times up to {times[np.isfinite(times)].max():.6g}, got "
-            f"{step:.6g}"
-        )
+        most = times[np.isfinite(times)].max()
+        raise InvalidArgumentError(f"--step: too short for times up to {most:.6g}, got {step:.6g}")
     return steps
 
 
@@ -160,47 +162,28 @@ def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
     if None not in (wanted, in_file) and wanted != in_file:
         raise invalid("--unit", f"{in_file}, as in {name}", wanted)
     if wanted is None and in_file is None and words not in ("", "1"):
-        raise invalid(
-            name, "times in days or smaller units", f"'{words}'; give the unit with --unit"
-        )
+        got = f"'{words}'; give the unit with --unit"
+        raise invalid(name, "times in days or smaller units", got)
     return wanted or in_file
 
 
-def _check_clock(name: str, time: Time | None, first_name: str, first: Time | None) -> None:
-    """Refuses a time that cannot be compared with the first layer's time."""
-    clocks = [each and each.clock for each in (first, time)]
-    if clocks[0] == clocks[1]:
-        return
-    both = [each for each in clocks if each and each.unit() and each.epoch() is not None]
-    if len(both) < 2 or both[0].calendar != both[1].calendar:
-        expected, got = (
-            "no time" if each is None else f"times in '{each.words}' ({each.calendar})"
-            for each in clocks
-        )
+def check_timed(names: list[str], times: list[Time]) -> None:
+    """Refuses layers of which only some have times."""
+    if times and len(times) < len(names):
+        timed = {
+            time.name: f"times in '{time.clock.words}' ({time.clock.calendar})" for time in times
+        }
+        name = next(name for name in names if (name in timed) != (names[0] in timed))
+        expected = f"{timed.get(names[0], 'no time')} as in {names[0]}"
+        raise invalid(name, expected, timed.get(name, "no time"))
+
+
+def _check_clock(name: str, clock: Clock, first_name: str, first: Clock) -> None:
+    """Refuses times that cannot be compared with the first layer's time."""
+    dated = [each for each in (clock, first) if each.unit() and each.epoch() is not None]
+    if clock != first and (len(dated) < 2 or clock.calendar != first.calendar):
+        expected, got = (f"times in '{each.words}' ({each.calendar})" for each in (first, clock))
         raise invalid(name, f"{expected} as in {first_name}", got)
-
-
-def _check_order(
-    names: list[str], times: list[Time | None], seconds: NDArray[np.float64], *, is_in_unit: bool
-) -> None:
-    """Refuses times that do not increase, or that are uneven and have no unit."""
-    gaps = np.diff(seconds)
-    for k, gap in enumerate(gaps.tolist(), start=1):
-        if gap <= 0:
-            before, got = (_shown(times[i], is_in_unit=is_in_unit) for i in (k - 1, k))
-            raise invalid(names[k], f"a later time than {before}", got)
-        if not is_in_unit and abs(gap - gaps[0]) > EVEN * gaps[0]:
-            raise InvalidArgumentError(
-                f"{names[k]}: expected times {gaps[0]:.6g} apart, like the first ones, got "
-                f"{gap:.6g}; to allow this, give the unit of times with --unit"
-            )
-
-
-def _shown(time: Time | None, *, is_in_unit: bool) -> str:
-    if time is None:
-        return "none"
-    unit = SECONDS[time.clock.unit() or "s"]
-    return (time.clock.date(time.value * unit) if is_in_unit else None) or f"{time.value:.6g}"
 
 
 def _unit(text: str) -> str:
