@@ -97,15 +97,6 @@ def timed(kind: str, values: ArrayLike, **given: Any) -> Variables:
     return grid(TIMES, time=TIME._replace(kind=kind, values=values).told(**given))
 
 
-def bounded(axis: Variable, name: str, half: float = 15.0) -> Variables:
-    """Returns coordinates at the first edges of cells. Only their bounds are correct."""
-    values = np.asarray(axis.values)
-    edges = np.stack([values - half, values + half], axis=1)
-    (dimension,) = axis.over
-    bounds = Variable(edges, "f8", (dimension, "two"))
-    return {name: axis._replace(values=edges[:, 0]).told(bounds="edges"), "edges": bounds}
-
-
 #: Contents of a file, and the states of its fire.
 APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
     "nothing": (grid(ONE), FIRE),
@@ -116,24 +107,7 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
     "limit as packed": (packed(valid_max=np.int16(2400)), WITHOUT_LAST),
     "limit as unpacked": (packed(valid_max=1500.0), FIRE),
     "lower limit as packed": (packed(valid_min=np.int16(600)), WITHOUT_FIRST),
-    "limit that is rounded": (
-        minutes(scale_factor=np.float32(1 / 60), units="h", valid_max=np.float32(3 / 60)),
-        steps(np.where(ARRIVAL > 180, -1, ARRIVAL))),
-    "limit of integers as unpacked": (
-        minutes(scale_factor=np.int32(60), valid_max=np.int32(180)),
-        steps(np.where(ARRIVAL > 180, -1, ARRIVAL))),
-    "range as unpacked": (packed(valid_range=[60.0, 300.0]), WITHOUT_FIRST),
-    "limits beyond an offset": (
-        minutes(scale_factor=60.0, add_offset=600.0, valid_min=600.0, valid_max=840.0),
-        WITHOUT_LAST),
     "limit of plain integers": (grid(ONE.told(valid_min=np.int16(60))), WITHOUT_FIRST),
-    "limit of plain numbers of 32 bits": (
-        grid(ONE._replace(values=ARRIVAL / 3600, kind="f4").told(units="h", valid_max=240 / 3600)),
-        WITHOUT_LAST),
-    "missing and fill value": (
-        numbers(np.where(ARRIVAL == 300, -1, np.where(ARRIVAL == 0, -2, ARRIVAL)),
-        missing_value=np.array([-3, -1], "i2"), _FillValue=-2),
-        steps(np.where((ARRIVAL == 0) | (ARRIVAL == 300), -1, ARRIVAL - 60))),
     # Time.
     "time": (timed("f8", [0, 1, 2, 3]), FIRE[:4]),
     "both of time": (timed("i1", [0, 1, 2, 3], scale_factor=1 / 60, add_offset=5.0, units="hours"),
@@ -147,17 +121,11 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
         FIRE[[0, 1, 1, 2, 3]]),
     # Axes.
     "columns before rows": (grid(ONE._replace(values=ARRIVAL.T, over=("x", "y"))), FIRE),
-    "columns before rows by standard names": (
-        {"a": Variable(X.values, "f8", ("a",), {"standard_name": "projection_x_coordinate"}),
-        "b": Variable(Y.values, "f8", ("b",), {"standard_name": "projection_y_coordinate"}),
-        "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))}, FIRE),
     "columns before rows by units": (
         {"a": LON._replace(over=("a",)), "b": LAT._replace(over=("b",)),
         "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))}, FIRE),
     "columns before rows by names": (
         {"v": ONE._replace(values=ARRIVAL.T[:, ::-1], over=("lon", "lat"))}, FIRE),
-    "rows by an axis alone": (
-        {"b": Y._replace(over=("b",)), "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))}, FIRE),
     "time last": (
         grid(TIMES._replace(values=np.moveaxis(MASKS, 0, 2), over=("y", "x", "time")), time=TIME),
         FIRE[:4]),
@@ -175,11 +143,6 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
     "longitudes across 360": (
         {"lat": LAT, "lon": LON._replace(values=np.asarray(LON.values) % 360),
         "v": ONE._replace(over=("lat", "lon"))}, FIRE),
-    "bounds across 360": (
-        {"lat": LAT, "lon": LON._replace(values=np.asarray(LON.values) % 360).told(bounds="edges"),
-        "edges": Variable([[359.85, 359.95], [359.95, 0.05], [0.05, 0.15], [0.15, 0.25]], "f8",
-        ("lon", "2")), "v": ONE._replace(over=("lat", "lon"))}, FIRE),
-    "bounds": ({**bounded(X, "x"), "y": Y, "v": ONE}, FIRE),
 }  # fmt: skip
 
 
@@ -267,8 +230,6 @@ CURVED = Variable(np.zeros((3, 4)), "f8", ("y", "x"), {"units": "degrees_north"}
 REFUSED: list[tuple[Any, ...]] = [
     ("a.nc, x: expected cells of one size side by side, got some of 30 and some of 90",
         grid(ONE, x=X._replace(values=[15, 45, 75, 165]))),
-    ("a.nc, x: expected cells of one size side by side, got some of 0 and some of 0",
-        grid(ONE, x=X._replace(values=[15, 15, 15, 15]))),
     ("a.nc, x: expected cells of one size side by side, got some of nan",
         grid(ONE, x=X._replace(values=[15, 45, -1, 105]).told(missing_value=-1.0))),
     ("a.nc, x: expected cells of one size side by side, got some of 30 and some of inf",
@@ -298,11 +259,6 @@ REFUSED: list[tuple[Any, ...]] = [
     ("a.nc, time: expected no climatology, got 'edges'",
         timed("f8", [0, 1, 2, 3], climatology="edges")
         | {"edges": Variable(np.zeros((4, 2)), "f8", ("time", "two"))}),
-    ("flag_meanings: expected 0 to mean unburnt, got 'burnt'; --kind and --codes set",
-        grid(TIMES.told(flag_values=np.array([0, 1, 2], "u1"),
-        flag_meanings="burnt fire unburnt")), ("--kind=states",)),
-    ("flag_meanings: expected 0 to mean unburnt, got 'burned'; --kind and --codes set",
-        grid(TIMES.told(flag_values=np.array([0, 1], "u1"), flag_meanings="burned unburned"))),
 ]  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from emberwatch.landscape.grid import (
     resampled,
     target_shape,
 )
-from emberwatch.landscape.layers import Layer
+from emberwatch.landscape.layers import Layer, check_full, where
 from emberwatch.landscape.schedule import (
     SECONDS,
     Time,
@@ -33,15 +33,12 @@ from emberwatch.landscape.schedule import (
     unit_of,
     without_times,
 )
-from emberwatch.landscape.world import STATES
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 
 Kind = Literal["arrival", "mask", "burning", "states"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 
-#: Parts of words that identify each state, in the order of the search.
-_WORDS: Final = (("not_burn", "unburn"), ("burning",), ("burned", "burnt"))
 MOST_STATES: Final = 1 << 31  # maximum size of a sequence, bytes
 #: Numbers below 0 that files use for "no value", and the number below which all others are, too.
 _CODES: Final = (-1, -9, -99, -999, -9999, -99999, -32767, -32768, -2147483647, -2147483648)
@@ -69,27 +66,19 @@ class Times(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meaning:
-    """The interpretation of the numbers in the layers, from the flags."""
+    """The interpretation of the numbers in the layers, from the flags (docs/landscapes.md)."""
 
     kind: Kind
     seconds: float
     """Duration of a step."""
     unit: str | None = None
-    """Unit of arrival times, or of the times of layers; None: the file's unit."""
     begin: float | None = None
-    """The arrival time of step 0; earlier arrivals are moved to it. None: the earliest arrival."""
     year_days: int | None = None
-    """Number of days of the first year, if arrivals are days of the year; None: they are not."""
     burning: int = 1
-    """Number of steps that a cell burns after its arrival."""
     every: int = 1
-    """If layers have no times, every `every`-th layer becomes a step."""
     codes: tuple[float, float, float] = (UNBURNT, BURNING, BURNT)
-    """The numbers that mean unburnt, burning and burnt, for the kind `states`."""
     oblong: bool = False
-    """Whether to treat cells that are not square as squares."""
     missing_is_unburnt: bool = False
-    """Whether to treat cells without a value as unburnt."""
     height: int | None = None
     width: int | None = None
     cell: float | None = None
@@ -110,11 +99,9 @@ def states(fire: Times) -> NDArray[np.uint8]:
     if fire.n_steps < 2:
         raise invalid(fire.name, "at least 2 steps", fire.n_steps)
     if fire.n_steps * height * width > MOST_STATES:
-        raise InvalidArgumentError(
-            f"{fire.name}: expected at most {MOST_STATES} bytes of states, got "
-            f"{fire.n_steps:.15g} steps of {height} x {width} cells; use a longer --step or "
-            "--every, or a smaller grid"
-        )
+        got = f"{fire.n_steps} steps of {height} x {width} cells"
+        remedy = "use a longer --step or --every, or a smaller grid"
+        raise invalid(fire.name, f"at most {MOST_STATES} bytes of states", f"{got}; {remedy}")
     sequence = np.empty((fire.n_steps, height, width), np.uint8)
     for k, step in enumerate(sequence):
         np.add(fire.arrival <= k, fire.burnt <= k, out=step, dtype=np.uint8, casting="unsafe")
@@ -165,10 +152,8 @@ def _check_negative(layer: Layer, meaning: Meaning) -> None:
         negative &= np.isin(layer.values, _CODES) | (layer.values < _LEAST)
     # If every cell has a time, a negative time may mean that the cell never burns.
     if negative.any():
-        raise InvalidArgumentError(
-            f"{layer.name}: expected times of at least 0, got {_first(layer, negative)}; if it "
-            "means never, give --nodata; if the cell burnt before, --begin 0"
-        )
+        remedy = "if it means never, give --nodata; if the cell burnt before, --begin 0"
+        raise invalid(layer.name, "times of at least 0", f"{_first(layer, negative)}; {remedy}")
 
 
 def _over_new_year(
@@ -190,7 +175,7 @@ def _over_new_year(
         return (f"{words}; if these are days of the year, give --year-days 365 (or 366)",)
     arrival[arrival < following] += meaning.year_days
     return (
-        f"days {days[0]:g} to {last:g} are in the year after days {following:g} to {days[-1]:g}",
+        f"days {days[0]:g} to {last:g} follow New Year, and days {following:g} to {days[-1]:g}",
     )
 
 
@@ -199,6 +184,7 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
     state, mark = np.empty(0, np.uint8), math.nan
     arrival = burnt = np.empty(0, np.float32)  # numbers of layers
     names, stamps = list[str](), list[Time]()
+    codes = meaning.codes if meaning.kind == "states" else (0.0,)
     for k, layer in enumerate(layers):
         if first is None:
             first, state = layer, np.zeros(layer.place.shape, np.uint8)
@@ -206,8 +192,9 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
         check_same(layer.place, layer.name, first.place, first.name)
         names.append(layer.name)
         stamps += [layer.time] if layer.time else []
-        _fill_missing(layer, meaning)
-        _check_flags(layer, meaning)
+        if not meaning.missing_is_unburnt:
+            check_full(layer, "a value in each cell", "--missing-is-unburnt treats them as unburnt")
+        layer.values[np.isnan(layer.values)] = codes[0]
         if meaning.kind == "states":
             now = _coded(layer, meaning)
         else:
@@ -258,15 +245,6 @@ def _on_world(
     return place, first, np.where(burns, last, np.inf)
 
 
-def _fill_missing(layer: Layer, meaning: Meaning) -> None:
-    missing = np.isnan(layer.values)
-    if missing.any() and not meaning.missing_is_unburnt:
-        remedy = "--missing-is-unburnt treats them as unburnt"
-        got = f"none in {missing.sum()} cells, the first {_cell(missing)}; {remedy}"
-        raise invalid(layer.name, "a value in each cell", got)
-    layer.values[missing] = meaning.codes[0] if meaning.kind == "states" else 0.0
-
-
 def _coded(layer: Layer, meaning: Meaning) -> NDArray[np.uint8]:
     """Returns the states that codes mean."""
     now = np.full(layer.values.shape, len(meaning.codes), np.uint8)
@@ -299,24 +277,6 @@ def _marked(
     return now, mark
 
 
-def _check_flags(layer: Layer, meaning: Meaning) -> None:
-    """Refuses numbers to which the file's own attributes give another meaning."""
-    for number, word in layer.flags:
-        if meaning.kind == "states":
-            taken = [state for state, code in enumerate(meaning.codes) if code == number]
-        elif number == 0:
-            taken = [UNBURNT] if meaning.kind == "mask" else [UNBURNT, BURNT]
-        else:
-            taken = [BURNING, BURNT]
-        said = [k for k, words in enumerate(_WORDS) if any(each in word.lower() for each in words)]
-        if taken and said and said[0] not in taken:
-            raise invalid(
-                f"{layer.name}, flag_meanings",
-                f"{number:.6g} to mean {' or '.join(STATES[state].name for state in taken)}",
-                f"'{word}'; --kind and --codes set the meaning of numbers",
-            )
-
-
 def _check_order(layer: Layer, before: NDArray[np.uint8], now: NDArray[np.uint8]) -> None:
     """Refuses states that cannot follow those of the previous layer."""
     for state, words in (
@@ -326,7 +286,7 @@ def _check_order(layer: Layer, before: NDArray[np.uint8], now: NDArray[np.uint8]
         wrong = (now == state) & (before > state)
         if wrong.any():
             words = words.format(wrong.sum())
-            raise InvalidArgumentError(f"{layer.name}: expected {words}, the first {_cell(wrong)}")
+            raise InvalidArgumentError(f"{layer.name}: expected {words}, the first {where(wrong)}")
 
 
 def _at(layers: NDArray[np.floating[Any]], steps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -335,10 +295,5 @@ def _at(layers: NDArray[np.floating[Any]], steps: NDArray[np.float64]) -> NDArra
     return np.append(steps, np.inf)[numbers]
 
 
-def _cell(cells: NDArray[np.bool_]) -> str:
-    row, column = np.argwhere(cells)[0].tolist()
-    return f"in row {row}, column {column}"
-
-
 def _first(layer: Layer, cells: NDArray[np.bool_]) -> str:
-    return f"{layer.values[cells][0]:.9g} {_cell(cells)}"
+    return f"{layer.values[cells][0]:.9g} {where(cells)}"

@@ -6,7 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from emberwatch.errors import invalid
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape import detections, netcdf, numpy_file, perimeters, raster
 from emberwatch.landscape.layers import Choice, Layer
 from emberwatch.landscape.order import ordered
@@ -23,6 +23,8 @@ _READERS: Final = {
     ".shp": perimeters.read,
     ".csv": detections.read,
 }
+#: Formats without variables.
+_UNNAMED: Final = (".tif", ".tiff", ".asc", ".npy", ".csv")
 #: Endings of auxiliary files, which GDAL reads together with the raster of the same name.
 _AUXILIARY: Final = (".prj", ".tfw", ".xml", ".dbf", ".shx", ".cpg")
 
@@ -74,6 +76,9 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool, order: str | None = N
 def read(files: Sequence[Path], choice: Choice) -> Generator[Layer]:
     """Yields the layers of files in order. Each file is closed after its last layer."""
     for file in files:
+        if choice.variable is not None and file.suffix.lower() in _UNNAMED:
+            got = f"'{choice.variable}'; leave the flag out"
+            raise InvalidArgumentError(f"--variable: {file} has no variables, got {got}")
         with closing(_READERS[file.suffix.lower()](file, choice)) as layers:
             yield from layers
 

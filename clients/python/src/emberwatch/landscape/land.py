@@ -19,7 +19,7 @@ from emberwatch.landscape.elevation import slopes
 from emberwatch.landscape.flags import add_common, several
 from emberwatch.landscape.grid import check_same
 from emberwatch.landscape.inputs import read, stacks
-from emberwatch.landscape.layers import Choice, Layer
+from emberwatch.landscape.layers import Choice, Layer, check_full
 from emberwatch.landscape.lengths import METRES, side
 from emberwatch.landscape.terrain import model_text, slope_and_wind
 from emberwatch.landscape.world import Fill, check_new, write
@@ -70,20 +70,14 @@ def _make(flags: argparse.Namespace) -> None:
     check_new("--out", flags.out, force=flags.force)
     layers = _layers(flags)
     shape = next(iter(layers.values())).place.shape
-    slope = None
+    rise, notes = np.zeros((2, *shape)), list[str]()
     if "elevation" in layers:
-        slope = slopes(
-            layers["elevation"],
-            cell=flags.cell,
-            height_unit=flags.height_unit,
-            oblong=flags.oblong,
-        )
-    rise = np.zeros((2, *shape)) if slope is None else slope.rise
+        given = {"cell": flags.cell, "height_unit": flags.height_unit, "oblong": flags.oblong}
+        rise, notes = slopes(layers["elevation"], **given)
     maps = {"slope_wind": slope_and_wind(rise, flags.wind_speed, flags.wind_towards)}
     if "fuel" in layers:
         maps = {"fuel": _fuel(flags, layers["fuel"])} | maps
     maps = {key: _rounded(factors) for key, factors in maps.items() if (factors != 1.0).any()}
-    notes = [] if slope is None else slope.notes
     contents = _files(flags, maps, layers.get("no_fly"))
     files = {key: utf8("--out", file.name) for key, (file, _) in contents.items()}
     comments = "".join(f"# {line}\n" for line in (_origin(flags, layers), *notes))
@@ -103,9 +97,7 @@ def _check_flags(flags: argparse.Namespace) -> None:
     if flags.out.suffix != ".toml":
         raise invalid("--out", "a .toml file", flags.out)
     if (flags.elevation, flags.fuel, flags.no_fly) == (None, None, None):
-        raise InvalidArgumentError(
-            "rasters: expected at least one of ELEVATION, --fuel and --no-fly, got none"
-        )
+        raise invalid("rasters", "at least one of ELEVATION, --fuel and --no-fly", "none")
     needs = dict.fromkeys(("cell", "height_unit", "oblong"), "elevation")
     needs |= dict.fromkeys(("factors", "unburnable", "missing_class"), "fuel")
     for flag, needed in needs.items():
@@ -114,9 +106,7 @@ def _check_flags(flags: argparse.Namespace) -> None:
             word = "ELEVATION" if needed == "elevation" else "--fuel"
             raise InvalidArgumentError(f"--{flag.replace('_', '-')}: applies only with {word}")
     if flags.fuel is not None and (flags.factors, flags.unburnable) == (None, None):
-        raise InvalidArgumentError(
-            "--fuel: expected --factors or --unburnable with it, got neither"
-        )
+        raise invalid("--fuel", "--factors or --unburnable with it", "neither")
     flags.cell = None if flags.cell is None else side("--cell", flags.cell)
     if flags.missing_class is not None and abs(flags.missing_class) > _MOST_NUMBER:
         raise invalid("--missing-class", f"at most {_MOST_NUMBER}", flags.missing_class)
@@ -128,7 +118,7 @@ def _check_wind(flags: argparse.Namespace) -> None:
     if not 0.0 <= flags.wind_speed <= _MOST_WIND:
         raise invalid("--wind-speed", f"0 to {_MOST_WIND:g} m/s", flags.wind_speed)
     if None not in (flags.wind_towards, flags.wind_from):
-        raise InvalidArgumentError("wind: expected --wind-towards or --wind-from, got both")
+        raise invalid("wind", "--wind-towards or --wind-from", "both")
     if flags.wind_from is not None:
         degrees = bearing(flags.wind_from)
         if degrees is None or not -360.0 <= degrees <= 360.0:
@@ -136,10 +126,8 @@ def _check_wind(flags: argparse.Namespace) -> None:
             raise invalid("--wind-from", expected, f"'{flags.wind_from}'")
         flags.wind_towards = (270.0 - degrees) % 360.0
     if (flags.wind_speed > 0.0) != (flags.wind_towards is not None):
-        raise InvalidArgumentError(
-            "wind: expected both a --wind-speed above 0 and --wind-from (or --wind-towards), or "
-            "neither, got only one of them"
-        )
+        both = "both a --wind-speed above 0 and --wind-from (or --wind-towards)"
+        raise invalid("wind", f"{both}, or neither", "only one of them")
     flags.wind_towards = flags.wind_towards or 0.0
     if not -360.0 <= flags.wind_towards <= 360.0:
         raise invalid("--wind-towards", "-360 to 360 degrees", flags.wind_towards)
@@ -153,18 +141,9 @@ def _layers(flags: argparse.Namespace) -> dict[str, Layer]:
         file = getattr(flags, key)
         if file is not None:
             layers[key] = layer = _layer(file, choice)
-            _check_grid(layer, next(iter(layers.values())))
+            first = next(iter(layers.values()))
+            check_same(layer.place, layer.name, first.place, first.name)
     return layers
-
-
-def _check_grid(layer: Layer, first: Layer) -> None:
-    (height, width), (rows, columns) = first.place.shape, layer.place.shape
-    if (height, width) != (rows, columns):
-        expected = f"{height} x {width} cells as in {first.name}"
-        raise invalid(layer.name, expected, f"{rows} x {columns}")
-    # NumPy files do not state the positions of their cells.
-    if layer.place.corner is not None and first.place.corner is not None:
-        check_same(layer.place, layer.name, first.place, first.name)
 
 
 def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:
@@ -243,13 +222,9 @@ def _check_codes(layer: Layer, is_named: NDArray[np.bool_], remedy: str) -> None
 
 
 def _whole(layer: Layer, missing_class: int | None) -> NDArray[np.int64]:
-    missing = np.isnan(layer.values)
-    if missing.any() and missing_class is None:
-        row, column = np.argwhere(missing)[0].tolist()
-        got = f"none in {missing.sum()} cells, the first in row {row}, column {column}"
-        remedy = "--missing-class N gives them the class N"
-        raise invalid(layer.name, "a number in each cell", f"{got}; {remedy}")
-    values = np.where(missing, missing_class or 0, layer.values)
+    if missing_class is None:
+        check_full(layer, "a number in each cell", "--missing-class N gives them the class N")
+    values = np.nan_to_num(layer.values, nan=missing_class or 0)
     wrong = values[(values % 1 != 0) | (np.abs(values) > _MOST_NUMBER)]
     if wrong.size:
         raise invalid(layer.name, "whole numbers, each a class of fuel", wrong[0])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
-from emberwatch.landscape.grid import Place, crop, part
+from emberwatch.landscape.grid import Place, crop
 from emberwatch.landscape.schedule import Clock, Time
 
 MOST_CELLS: Final = 1 << 27  # maximum number of used cells of a layer: 1 GiB of doubles
@@ -19,13 +19,12 @@ _ROUNDED: Final = float(np.finfo(np.float32).eps)  # relative tolerance for `nod
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choice:
-    """The part of each file to read, from the flags."""
+    """The part of each file to read, from the flags (docs/landscapes.md)."""
 
     variable: str | None = None
     band: int | None = None
     nodata: tuple[float, ...] = ()
     crop: tuple[int, ...] | None = None
-    """Top, left, height and width of the window to read; None: all cells."""
     cell: float | None = None
     """Side of the cells that perimeters and detections are drawn on, metres; None: refuse these."""
     time_column: str | None = None
@@ -44,8 +43,6 @@ class Layer:
     """The unit of the values, if they are times."""
     stored: np.dtype[Any] = np.dtype(np.float64)
     """The type of the numbers in the file."""
-    flags: tuple[tuple[float, str], ...] = ()
-    """The meanings of single numbers, if the file states them."""
     time: Time | None = None
     """The time of the layer, if the file states it."""
     notes: tuple[str, ...] = ()
@@ -60,8 +57,7 @@ def window(
     Returns the values, NaN for `choice.nodata`, and the grid of the window. Strips of rows are read
     one after the other, so that only the result is in memory.
     """
-    rows, columns = crop(place, choice.crop)
-    cut = part(place, (rows, columns))
+    (rows, columns), cut = crop(place, choice.crop)
     height, width = cut.shape
     if height * width > MOST_CELLS:
         raise invalid(name, f"at most {MOST_CELLS} cells; use --crop", f"{height} x {width}")
@@ -74,6 +70,20 @@ def window(
         for number in choice.nodata:
             values[top:bottom][np.isclose(read, number, rtol=_ROUNDED, atol=0.0)] = np.nan
     return values, cut
+
+
+def check_full(layer: Layer, expected: str, remedy: str) -> None:
+    """Refuses a layer with a cell that has no value."""
+    missing = np.isnan(layer.values)
+    if missing.any():
+        got = f"none in {missing.sum()} cells, the first {where(missing)}; {remedy}"
+        raise invalid(layer.name, expected, got)
+
+
+def where(cells: NDArray[np.bool_]) -> str:
+    """Names the first of the cells, for errors."""
+    row, column = np.argwhere(cells)[0].tolist()
+    return f"in row {row}, column {column}"
 
 
 def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str:

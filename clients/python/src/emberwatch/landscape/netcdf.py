@@ -78,8 +78,6 @@ def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
     array = array.transpose(*(axes[letter] for letter in "TYX" if letter in axes))
     array = array if array.ndim == 3 else array.expand_dims("layer")
     low, high = _limits(f"{file}, {array.name}", array)
-    flags = np.atleast_1d(array.attrs.get("flag_values", array.attrs.get("flag_masks", ())))
-    meanings = str(array.attrs.get("flag_meanings", "")).split()
     for band in choose_bands(file, len(array), choice):
         name = f"{file}, band {band}" if len(array) > 1 else str(file)
         time = times[band - 1]._replace(name=name) if times else None
@@ -93,7 +91,6 @@ def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
             place=cut,
             clock=_clock(array),
             stored=array.encoding["dtype"],
-            flags=tuple(zip(flags.tolist(), meanings, strict=False)),
             time=time,
         )
 

@@ -33,11 +33,6 @@ def _array(file: Path, choice: Choice) -> NDArray[Any]:
                 with np.load(opened) as archive:
                     name = choose_variable(file, archive.files, choice.variable)
                     return np.asarray(archive[name])
-        if choice.variable is not None:
-            raise InvalidArgumentError(
-                f"--variable: {file} has only one array, without a name, got '{choice.variable}'; "
-                "leave the flag out"
-            )
         loaded: NDArray[Any] = np.load(file, mmap_mode="r")
         return loaded
     except InvalidArgumentError:

@@ -14,7 +14,7 @@ _MONTHS: Final = tuple("jan feb mar apr may jun jul aug sep oct nov dec".split()
 _WORD: Final = rf"(?:{'|'.join(_MONTHS)})[a-z]*"
 #: Dates that numbers order correctly.
 _YEAR_FIRST: Final = re.compile(
-    r"(?<!\d)(?:19|20)\d\d[-_. ]?(?:0?[1-9]|1[0-2])[-_. ]?(?:0[1-9]|[12]\d|3[01])"
+    r"(?<!\d)(?<!\d[-_. ])(?:19|20)\d\d[-_. ]?(?:0?[1-9]|1[0-2])[-_. ]?(?:0[1-9]|[12]\d|3[01])"
 )
 #: Two numbers, or a number and the name of a month, and the year. Without marks between the
 #: numbers, or with spaces, a year has four digits.
@@ -27,9 +27,9 @@ _YEAR_LAST: Final = re.compile(
 def ordered(folder: Path, files: list[Path], order: str | None) -> tuple[list[Path], str]:
     """Returns the files in order, and a note on this order; None: the order that names imply."""
     possible = [order] if order else _possible(files)
-    found = {tuple(sorted(files, key=lambda file: _key(file, one))): one for one in possible}
+    found = {tuple(sorted(files, key=lambda file: _key(file, one))): one for one in possible[::-1]}
     if len(found) != 1:
-        orders = " or ".join(found.values()) or "numbers"
+        orders = " or ".join(sorted(found.values())) or "numbers"
         expected = f"{orders}, as the dates in the names in {folder} are unclear"
         raise invalid("--order", expected, f"none, and {files[0].name}")
     ((names, rule),) = found.items()

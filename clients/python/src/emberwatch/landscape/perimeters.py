@@ -57,7 +57,7 @@ def seconds_of(subject: str, words: Any, form: str = "ISO8601") -> Any:
     wrong = np.flatnonzero(times.isna())
     if wrong.size:
         got = f"'{words.iloc[wrong[0]]}' in row {wrong[0]}"
-        raise invalid(subject, "times such as 2020-08-31T12:00Z in each row", got)
+        raise invalid(subject, "times such as 2020-08-31T12:00:00Z in each row", got)
     return (times - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy()
 
 
@@ -86,7 +86,7 @@ def drawn(file: Path, shapes: Any, times: Any, choice: Choice, **more: Any) -> L
         got = f"{height} x {width}; use a larger --cell"
         raise invalid(file, f"perimeters on at most {MOST_CELLS} cells", got)
     order = np.argsort(-times, kind="stable")
-    transform = library("rasterio.transform", file).from_origin(left, top, side, side)
+    transform = library("rasterio", file).Affine(side, 0.0, left, 0.0, -side, top)
     arrival = library("rasterio.features", file).rasterize(
         zip(shapes.iloc[order], times[order], strict=True),
         out_shape=(height, width), fill=np.nan, transform=transform, dtype="float64",
@@ -105,9 +105,10 @@ def _polygons(file: Path, table: Any) -> tuple[Any, list[str]]:
     shapes = getattr(table, "geometry", None)
     if shapes is None or not len(table):
         raise invalid(file, "polygons", "none")
-    for row, kind in enumerate(shapes.geom_type.where(~shapes.is_empty)):
+    for row, one in enumerate(shapes):
+        kind = "none" if one is None or one.is_empty else one.geom_type
         if kind not in ("Polygon", "MultiPolygon"):
-            raise invalid(file, "a polygon in each row", f"{kind or 'none'} in row {row}")
+            raise invalid(file, "a polygon in each row", f"{kind} in row {row}")
     if shapes.crs is None:
         remedy = "set it (ogr2ogr -a_srs)"
         raise invalid(file, "a coordinate reference system", f"none; {remedy}")
@@ -125,7 +126,7 @@ def _times(file: Path, columns: Any, wanted: str | None) -> tuple[Any, Clock, li
     dated = [name for name, column in words.items() if column.str.match(_DATE).any()]
     if wanted is None and len(dated) != 1:
         got = f"{len(dated)} ({', '.join(map(str, dated)) or known}); choose with --time-column"
-        raise invalid(file, "one column of times such as 2020-08-31T12:00Z", got)
+        raise invalid(file, "one column of times such as 2020-08-31T12:00:00Z", got)
     name = dated[0] if wanted is None else wanted
     if name not in dated and columns[name].dtype.kind in "if":
         return columns[name].to_numpy(np.float64), Clock(), []

@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,10 +29,6 @@ _HEADER: Final = re.compile(
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
     """Yields the bands of a file, which is closed after the last one."""
-    if choice.variable is not None:
-        raise InvalidArgumentError(
-            f"--variable: {file} has no variables, got '{choice.variable}'; leave the flag out"
-        )
     is_ascii = file.suffix.lower() == ".asc"
     driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
     rioxarray, rasterio = library("rioxarray", file), library("rasterio", file)
@@ -41,7 +38,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
     with warnings.catch_warnings(action="ignore"):
         try:
             with rasterio.open(path, driver=driver) as source, ExitStack() as stack:
-                place, bands = _place(file, source), _bands(file, source, choice)
+                place, (bands, alpha) = _place(file, source), _bands(file, source, choice)
                 if is_ascii:
                     arrays = [_ascii(file, source)]
                 else:
@@ -54,6 +51,10 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
                     name = f"{file}, band {band}" if source.count > 1 else str(file)
                     array = _turned(arrays[band - 1], source.transform)
                     values, cut = window(name, array, place, choice)
+                    if alpha:
+                        array = _turned(arrays[alpha - 1], source.transform)
+                        is_valid = window(name, array, place, replace(choice, nodata=()))[0] > 0
+                        values[~is_valid] = np.nan
                     yield Layer(
                         name=name,
                         values=values,
@@ -68,28 +69,23 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
             raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
 
 
-def _bands(file: Path, source: Any, choice: Choice) -> Sequence[int]:
-    """Returns the numbers of the bands with values. An alpha band marks cells without a value."""
+def _bands(file: Path, source: Any, choice: Choice) -> tuple[Sequence[int], int]:
+    """Returns the bands with values, and the alpha band, which is 0 in cells without; 0: none."""
     if source.subdatasets:
         pages = f"{len(source.subdatasets)} pages; make bands of them (gdal_merge.py -separate)"
         raise invalid(file, "one image", pages)
     bands = choose_bands(file, source.count, choice)
     if any(source.dtypes[band - 1].startswith("complex") for band in bands):
         raise invalid(file, "real numbers", source.dtypes[bands[0] - 1])
-    if choice.band is not None:
-        return bands
-    alpha = {band for band in bands if source.colorinterp[band - 1].name == "alpha"}
-    auxiliary = alpha | {
-        band for band in bands if _AUXILIARY.search(source.descriptions[band - 1] or "")
-    }
-    if auxiliary == alpha and len(alpha) == len(bands) - 1:
-        return [band for band in bands if band not in alpha]
-    if auxiliary:
-        first = min(auxiliary)
-        label = source.descriptions[first - 1] or "alpha"
-        remedy = "choose the layer with --band, or remove other bands (gdal_translate -b)"
-        raise invalid(file, "bands of layers", f"band {first}, '{label}'; {remedy}")
-    return bands
+    kinds, labels = source.colorinterp, source.descriptions
+    alpha = [band for band in source.indexes if kinds[band - 1].name == "alpha"]
+    odd = alpha + [band for band in bands if _AUXILIARY.search(labels[band - 1] or "")]
+    if choice.band is None and odd and not (odd == alpha and len(bands) == 2):
+        remedy = f"choose with --band; if it is one, gdal_edit.py -colorinterp_{odd[0]} gray"
+        got = f"band {odd[0]}, '{labels[odd[0] - 1] or 'alpha'}'; {remedy}"
+        raise invalid(file, "bands of layers", got)
+    others = [band for band in bands if band not in alpha]
+    return (others, min(alpha, default=0)) if others else (bands, 0)
 
 
 def _place(file: Path, source: Any) -> Place:
@@ -105,10 +101,10 @@ def _place(file: Path, source: Any) -> Place:
         )
     if transform.is_identity:
         return Place(shape=source.shape)
-    far = transform * (width, height)
+    east, south = transform.c + transform.a * width, transform.f + transform.e * height
     return Place(
         shape=source.shape,
-        corner=(min(transform.c, far[0]), max(transform.f, far[1])),
+        corner=(min(transform.c, east), max(transform.f, south)),
         cell=(abs(transform.a), abs(transform.e)),
         projection=crs.to_wkt() if crs else None,
     )

@@ -43,7 +43,7 @@ class Clock(NamedTuple):
         try:
             start = cftime.num2date(0, f"seconds since {date}", self.calendar)
             return float(cftime.date2num(start, SINCE_1970, self.calendar))
-        except (OverflowError, ValueError):  # not a day of the calendar
+        except (OverflowError, TypeError, ValueError):  # not a day of the calendar
             return None
 
     def date(self, seconds: float) -> str | None:
