@@ -2,8 +2,6 @@
 
 import io
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -113,14 +111,6 @@ def test_rows_run_from_the_north_and_columns_from_the_west(tmp_path: Path, out: 
         np.testing.assert_array_equal(one(out, file, *MINUTES), FIRE)
         part = one(out, file, *MINUTES, "--crop=0,1,2,3", "--begin=0")
         np.testing.assert_array_equal(part, FIRE[: len(part), :2, 1:])
-
-
-def test_earlier_arrivals_burn_from_step_0(tmp_path: Path, out: Path) -> None:
-    file = geotiff(tmp_path / "fire.tif", np.where(ARRIVAL == 0, -2147.5, ARRIVAL))
-    np.testing.assert_array_equal(one(out, file, *MINUTES, "--begin", 0), FIRE)
-    burns = np.where(ARRIVAL == NEVER, 99, np.where(ARRIVAL <= 20, 0, BEGIN - 2))
-    expected = [(burns <= k) + (burns + 2 <= k).astype(int) for k in range(4)]
-    np.testing.assert_array_equal(one(out, file, *MINUTES, "--begin", 20), expected)
 
 
 def test_each_arrival_file_or_layer_folder_is_a_sequence(tmp_path: Path, out: Path) -> None:
@@ -278,14 +268,6 @@ def test_the_input_can_be_cropped(tmp_path: Path, out: Path) -> None:
     np.testing.assert_array_equal(one(out, file, *MASKS, "--crop", "1,1,2,3"), FIRE[:4, 1:, 1:])
 
 
-def test_rounded_32_bit_times_fall_into_their_steps(tmp_path: Path, out: Path) -> None:
-    steps = np.arange(400).reshape(20, 20)
-    for unit, step, last in (("h", "6 min", 0.1), ("h", "10 min", 1 / 6), ("d", "1 h", 1 / 24)):
-        file = geotiff(tmp_path / "fire.tif", steps * last)
-        got = one(out, file, *ARRIVALS, "--unit", unit, "--step", step)
-        np.testing.assert_array_equal((got == 0).sum(axis=0), steps, step)
-
-
 def test_sequence_names_sort_in_order() -> None:
     file = io.BytesIO()
     arrays([np.zeros((2, 1, 1), np.uint8)] * 1001)(file)
@@ -337,11 +319,6 @@ def test_the_documents_list_the_flags_of_the_help(capsys: pytest.CaptureFixture[
         rows = re.findall(r"(?m)^\| `.*?\|", page[page.index("## Options") : page.index(end)])
         in_help = set(re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
         assert in_help == set(re.findall("--[a-z-]+", " ".join(rows))) and len(in_help) > 15
-
-
-def test_the_package_needs_no_rasterio() -> None:
-    code = "import sys, emberwatch, emberwatch.landscape; assert 'rasterio' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_shipped_landscape_matches_its_description() -> None:

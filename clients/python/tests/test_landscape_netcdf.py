@@ -89,10 +89,6 @@ def packed(**given: Any) -> Variables:
     return numbers(ARRIVAL * 10, scale_factor=0.1, **given)
 
 
-def minutes(**given: Any) -> Variables:
-    return numbers(ARRIVAL // 60, **given)
-
-
 def timed(kind: str, values: ArrayLike, **given: Any) -> Variables:
     return grid(TIMES, time=TIME._replace(kind=kind, values=values).told(**given))
 
@@ -102,12 +98,8 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
     "nothing": (grid(ONE), FIRE),
     # Numbers.
     "scale": (packed(), FIRE),
-    "scale and offset of 32 bits": (minutes(scale_factor=np.float32(60), add_offset=np.float32(6)),
-        FIRE),
     "limit as packed": (packed(valid_max=np.int16(2400)), WITHOUT_LAST),
     "limit as unpacked": (packed(valid_max=1500.0), FIRE),
-    "lower limit as packed": (packed(valid_min=np.int16(600)), WITHOUT_FIRST),
-    "limit of plain integers": (grid(ONE.told(valid_min=np.int16(60))), WITHOUT_FIRST),
     # Time.
     "time": (timed("f8", [0, 1, 2, 3]), FIRE[:4]),
     "both of time": (timed("i1", [0, 1, 2, 3], scale_factor=1 / 60, add_offset=5.0, units="hours"),
@@ -124,20 +116,15 @@ APPLIED: dict[str, tuple[Variables, NDArray[np.uint8]]] = {
     "columns before rows by units": (
         {"a": LON._replace(over=("a",)), "b": LAT._replace(over=("b",)),
         "v": ONE._replace(values=ARRIVAL.T, over=("a", "b"))}, FIRE),
-    "columns before rows by names": (
-        {"v": ONE._replace(values=ARRIVAL.T[:, ::-1], over=("lon", "lat"))}, FIRE),
     "time last": (
         grid(TIMES._replace(values=np.moveaxis(MASKS, 0, 2), over=("y", "x", "time")), time=TIME),
         FIRE[:4]),
-    "other names": ({"v": ONE._replace(values=ARRIVAL[::-1], over=("south", "west"))}, FIRE),
     "rising rows and falling columns": (
         grid(ONE._replace(values=ARRIVAL[::-1, ::-1]),
         **{name: it._replace(values=np.asarray(it.values)[::-1]) for name, it in AXES.items()}),
         FIRE),
     "packed coordinates": (
         grid(ONE, x=Variable([0, 1, 2, 3], "i2", ("x",), {**X.given, "scale_factor": 30.0})), FIRE),
-    "coordinates of 32 bits": (
-        grid(ONE, x=X._replace(kind="f4", values=8_000_015 + 30.3 * np.arange(4))), FIRE),
     "kilometres": (grid(ONE, x=X._replace(values=np.asarray(X.values) / 1000).told(units="km")),
         FIRE),
     "longitudes across 360": (
@@ -192,12 +179,6 @@ def test_scalar_times_apply_to_layers(tmp_path: Path) -> None:
         for minutes in (7, 10)
     ]
     np.testing.assert_array_equal(layer_files(tmp_path, *files), MASKS[[0, 0, 0, 2]])
-
-
-def test_the_start_date_includes_the_offset_of_packed_times(tmp_path: Path) -> None:
-    imported(written(tmp_path / "a.nc", **timed("i2", [-9, -8, -7, -6], add_offset=99.0)), 3)
-    text = (tmp_path / "a.toml").read_text("utf-8")
-    assert "# states_000 begins at 2020-08-01 01:30:00 UTC" in text
 
 
 def test_longitudes_of_0_to_360_degrees_are_wrapped(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
     """Yields the bands of a file, which is closed after the last one."""
     is_ascii = file.suffix.lower() == ".asc"
     driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
-    rioxarray, rasterio = library("rioxarray", file), library("rasterio", file)
+    rasterio, rioxarray = library("rasterio", file), library("rioxarray", file)
     path = Path(utf8("file", file.absolute()))
     # GDAL warns about files without a position, which are valid; its other warnings do not help
     # users.
