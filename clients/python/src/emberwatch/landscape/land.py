@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--factors", type=_factors, metavar="N=X,N=X", help="factors of the hazard of classes [1]")
     add("--unburnable", type=_CLASSES, metavar="N,N", help="classes of --fuel that never burn")
     add("--missing-class", type=int, metavar="N", help="class of cells without a value in --fuel")
-    add("--no-fly", type=Path, metavar="RASTER", help="a number other than 0 is a no-fly cell")
+    add("--no-fly", type=Path, metavar="RASTER", help="a number above 0 is a no-fly cell")
     add_common(parser)
     return parser
 
