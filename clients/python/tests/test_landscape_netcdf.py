@@ -232,7 +232,7 @@ REFUSED: list[tuple[Any, ...]] = [
         {"lat": CURVED, "v": ONE.told(coordinates="lat lon")}),
     ("a.nc: expected real numbers, got uint8 (0, 3, 4)",
         {"v": Variable(np.zeros((0, 3, 4)), "u1", ("time", "y", "x"))}),
-    ("a.nc, v, valid range: expected two signed numbers, got 3",
+    ("a.nc, v, valid_range: expected two numbers, got 3",
         grid(ONE.told(valid_range=np.int16(3)))),
     ("expected times in days or smaller units, got 'months since 2020-08-01'; give the",
         timed("f8", [0, 1, 2, 3], units="months since 2020-08-01")),

@@ -131,7 +131,7 @@ CASES: list[tuple[str, Case]] = [
         lambda f: (*days(f, "hours since 2020-08-02", "hours since 2020-08-01"), *MASKS)),
     ("expected times in 'hours since 2020-08-01' (standard) as in ",
         lambda f: (*days(f, "hours since 2020-08-01", "hours since start"), *MASKS)),
-    ("--every: applies only to layers without times, got --every 2: ",
+    ("--every: expected only with layers without times, got 2: ",
         lambda f: (days(f, "hours", None)[0], *MASKS, "--every", 2)),
     ("has no times, got --unit s; leave the flag out",
         layers(MASKS, NONE, ONE, flags=("--unit", "s"))),

@@ -95,55 +95,38 @@ def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
         )
 
 
-def _limits(name: str, array: Any) -> list[float]:
-    """Returns the smallest and the largest valid number, unpacked; a tenth of a unit is allowed.
-
-    A limit of the file's type is packed, like the numbers.
-    """
+def _limits(name: str, array: Any) -> tuple[float, float]:
+    """Returns the smallest and largest valid number; packed ones have the type of the file."""
     given, packing = array.attrs, array.encoding
-    both = given.get(
-        "valid_range", (given.get("valid_min", -np.inf), given.get("valid_max", np.inf))
-    )
-    if (
-        np.size(both) != 2
-        or "_Unsigned" in packing
-        and {"valid_min", "valid_max", "valid_range"} & {*given}
-    ):
-        raise invalid(f"{name}, valid range", "two signed numbers", both)
+    limits = given.get("valid_min", -np.inf), given.get("valid_max", np.inf)
+    limits = given.get("valid_range", limits)
+    if np.size(limits) != 2:
+        raise invalid(f"{name}, valid_range", "two numbers", limits)
     scale, offset = packing.get("scale_factor", 1.0), packing.get("add_offset", 0.0)
-    is_packed = [np.asarray(limit).dtype == packing["dtype"] for limit in both]
     low, high = (
-        float(limit * scale + offset if packed else limit)
-        for limit, packed in zip(both, is_packed, strict=True)
+        float(limit * scale + offset if np.asarray(limit).dtype == packing["dtype"] else limit)
+        for limit in limits
     )
-    slack = abs(scale) / 10 if (scale, offset) != (1.0, 0.0) else 0.0
-    return [low * (1 - np.sign(low) * 1e-6) - slack, high * (1 + np.sign(high) * 1e-6) + slack]
+    slack = abs(scale) / 10 if array.dtype != packing["dtype"] else 0.0  # unpacked with rounding
+    return low - slack, high + slack
 
 
 def _axes(file: Path, array: Any) -> dict[str, str]:
     """Returns the dimensions of columns (X), rows (Y) and, if there is one, time (T)."""
-    letters = [_letter(file, array, name) for name in array.dims]
+    letters = list[str]()
+    for name in array.dims:
+        stated = [_stated(file, one) for one in _along(array, name)]
+        by_name = [letter for letter, words in _WORDS.items() if name.lower() in words]
+        letters.append(next(filter(None, [*stated, *by_name]), ""))
     for letter in "XY":  # by default, the last dimensions are rows and columns
         if letter not in letters and "" in letters:
             letters[len(letters) - 1 - letters[::-1].index("")] = letter
     if sorted(letters) not in (["X", "Y"], ["T", "X", "Y"]):
         pairs = list(zip(letters, array.dims, strict=True))
         wrong = [name for letter, name in pairs if letter in ("", "Z") or letters.count(letter) > 1]
-        raise invalid(
-            file,
-            "a variable with the dimensions time, rows and columns",
-            f"one with {', '.join(wrong or array.dims)}",
-        )
+        got = f"one with {', '.join(wrong or array.dims)}"
+        raise invalid(file, "a variable with the dimensions time, rows and columns", got)
     return dict(zip(letters, array.dims, strict=True))
-
-
-def _letter(file: Path, array: Any, dimension: str) -> str:
-    """Returns the axis that a dimension's coordinates or name state; empty if none."""
-    for one in _along(array, dimension):
-        letter = _stated(file, one)
-        if letter:
-            return letter
-    return "".join(letter for letter, words in _WORDS.items() if dimension.lower() in words)
 
 
 def _along(array: Any, dimension: str) -> list[Any]:
@@ -178,25 +161,23 @@ def _place(file: Path, array: Any, rows: str, columns: str) -> tuple[Place, tupl
     if x is None or y is None:
         return Place(shape=shape), turned
     units = [unit for unit in (_unit(file, one, mapping) for one in (x, y)) if unit]
-    unit = units[0] if units else None
+    length, is_angle = units[0] if units else (1.0, False)
     projection = _projection(file, mapping)
-    if unit and unit[1] and projection is None:
+    if is_angle and projection is None:
         projection = library("pyproj", file).CRS("EPSG:4326").to_wkt()
-    known = unit_of(projection) if projection else (1.0, units[0][1]) if unit else None
-    for one in units:
-        if known and one[1] != known[1]:
-            expected, got = ("degrees", "metres") if known[1] else ("metres", "degrees")
-            raise invalid(file, f"coordinates in {expected}, as its grid mapping or columns", got)
-    share = unit[0] / known[0] if unit and known else 1.0
-    if unit and unit[1]:
-        west = (round(west + 180, 9) % 360) - 180
+    known = (unit_of(projection) if projection else None) or (1.0, is_angle)
+    if any(unit[1] != known[1] for unit in units):
+        expected, got = ("degrees", "metres") if known[1] else ("metres", "degrees")
+        raise invalid(file, f"coordinates in {expected}, as its grid mapping or columns", got)
+    share = length / known[0] if units else 1.0
+    west = (round(west + 180, 9) % 360) - 180 if is_angle else west
     width, height = abs(width) or abs(height) or 1.0, abs(height) or abs(width) or 1.0
     place = Place(
         shape=shape,
         corner=((west - width / 2) * share, (south + (shape[0] - 0.5) * height) * share),
         cell=(width * share, height * share),
         projection=projection,
-        metres=1.0 if unit and not unit[1] else None,
+        metres=1.0 if units and not is_angle else None,
     )
     return place, turned
 
@@ -205,9 +186,7 @@ def _place(file: Path, array: Any, rows: str, columns: str) -> tuple[Place, tupl
 def _line(file: Path, one: Any) -> tuple[float, float]:
     """Returns the smallest coordinate, and the distance between two, below 0 if they decrease."""
     at: NDArray[np.float64] = one.values.astype(np.float64)
-    if not {one.name.lower(), str(one.attrs.get("units", "")).lower()}.isdisjoint(
-        _WORDS["X"] - {"x"}
-    ):
+    if str(one.attrs.get("units", "")).lower() in _WORDS["X"]:  # degrees east
         at = np.unwrap(at, period=360)
     step = float(at[-1] - at[0]) / max(1, at.size - 1)
     errors = at - at[0] - step * np.arange(at.size)
@@ -237,10 +216,8 @@ def _mapping(array: Any, columns: str) -> Mapping[str, Any]:
     """Returns the attributes of the grid mapping; if there are several, of the columns' mapping."""
     text = str(array.encoding.get("grid_mapping", ""))
     names = re.split(r"(\S+):", text)[1:]  # such as "name: x y other: lat lon"
-    of_columns = [
-        name for name, of in zip(names[::2], names[1::2], strict=True) if columns in of.split()
-    ]
-    name = of_columns[0] if of_columns else text
+    several = {of: name for name, of in zip(names[::2], names[1::2], strict=True)}
+    name = next((name for of, name in several.items() if columns in of.split()), text)
     return array.coords[name].attrs if name in array.coords else {}
 
 
@@ -266,11 +243,10 @@ def _times(file: Path, array: Any, dimension: str | None) -> list[Time]:
     A scalar may also be another time, such as a reference time. Numbers such as 20200831.5 become
     seconds.
     """
-    scalars = [one for one in array.coords.values() if one.ndim == 0]
-    found = _along(array, dimension) if dimension else [
-        one for one in scalars
-        if one.attrs.get("standard_name", "time") == "time" and _stated(file, one) == "T"
-    ]  # fmt: skip
+    found = _along(array, dimension) if dimension else []
+    for one in array.coords.values() if dimension is None else ():
+        is_time = one.ndim == 0 and one.attrs.get("standard_name", "time") == "time"
+        found += [one] if is_time and _stated(file, one) == "T" else []
     if not found:
         return []
     time = found[0]

@@ -68,12 +68,10 @@ class Time(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """The steps of the layers of one fire."""
+    """The first step that shows each layer, and the date of step 0 if the files have it."""
 
     steps: NDArray[np.float64]
-    """The first step that shows each layer."""
     begin: str | None = None
-    """The date of step 0, if the files have it."""
 
 
 def schedule(times: list[Time], *, step: float, every: int, unit: str | None) -> Schedule:
@@ -85,37 +83,27 @@ def schedule(times: list[Time], *, step: float, every: int, unit: str | None) ->
     first = times[0]
     for time in times:
         _check_clock(time.name, time.clock, first.name, first.clock)
-    stated = [unit_of(time.clock, unit, time.name) for time in times]
-    lengths = [SECONDS[each or "s"] for each in stated]
-    seconds = np.array(
-        [
-            time.value * length + (time.clock.epoch() or 0.0)
-            for time, length in zip(times, lengths, strict=True)
-        ]
-    )
-    for k, gap in enumerate(np.diff(seconds).tolist(), start=1):
-        even = seconds[1] - seconds[0]
-        if gap <= 0:
-            before, got = (
-                each.clock.date(each.value * length) or f"{each.value:.6g}"
-                for each, length in zip(times[k - 1 : k + 1], lengths[k - 1 : k + 1], strict=True)
-            )
-            raise invalid(times[k].name, f"a later time than {before}", got)
-        if stated[0] is None and abs(gap - even) > _EVEN * even:
-            raise InvalidArgumentError(
-                f"{times[k].name}: expected times {even:.6g} apart, like the first ones, got "
-                f"{gap:.6g}; to allow this, give the unit of times with --unit"
-            )
-    if stated[0] is None:
+    units = [unit_of(time.clock, unit, time.name) for time in times]
+    has_unit = units[0] is not None
+    lengths = [SECONDS[each or "s"] for each in units]
+    after = [time.value * length for time, length in zip(times, lengths, strict=True)]
+    seconds = np.array(after) + [time.clock.epoch() or 0.0 for time in times]
+    gaps = np.diff(seconds)
+    for k in np.flatnonzero(gaps <= 0)[:1]:
+        before, got = (times[i].clock.date(after[i]) or f"{times[i].value:.6g}" for i in (k, k + 1))
+        raise invalid(times[k + 1].name, f"a later time than {before}", got)
+    for k in [] if has_unit else np.flatnonzero(np.abs(gaps - gaps[:1]) > _EVEN * gaps[:1])[:1]:
+        got = f"{gaps[k]:.6g}; to allow this, give the unit of times with --unit"
+        expected = f"times {gaps[0]:.6g} apart, like the first ones"
+        raise invalid(times[k + 1].name, expected, got)
+    if not has_unit:
         return without_times(len(times), every)
     if every != 1:
-        raise InvalidArgumentError(
-            f"--every: applies only to layers without times, got --every {every}: {first.name} has "
-            "the time of each layer, and --step chooses among them"
-        )
+        got = f"{every}: {first.name} has times, and --step chooses among them"
+        raise invalid("--every", "only with layers without times", got)
     rounding = max(time.rounding for time in times) * lengths[0]
     steps = steps_at(seconds - seconds[0], step, rounding, first.name)
-    return Schedule(steps, first.clock.date(first.value * lengths[0]))
+    return Schedule(steps, first.clock.date(after[0]))
 
 
 def without_times(n_layers: int, every: int) -> Schedule:
