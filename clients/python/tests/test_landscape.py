@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import xarray
 from numpy.typing import NDArray
 from PIL import Image
 from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
@@ -141,8 +142,12 @@ def test_masks_from_files_bands_and_times_are_equal(tmp_path: Path, out: Path) -
     for end in "tif.ovr tif.aux.xml tif.vat.dbf qml tfw png prj xml".split():
         (folder / f"step_9.{end}").write_text("")
     np.savez(tmp_path / "fire.npz", burnt=layers.astype(bool), other=np.zeros(3))
+    xarray.Dataset({"burnt": (("time", "y", "x"), layers[:, ::-1].astype(bool))}).to_netcdf(
+        tmp_path / "bool.nc"
+    )
     for given in (
         (folder,),
+        (tmp_path / "bool.nc",),
         (geotiff(tmp_path / "bands.tif", *layers * 255, nodata=None),),
         (geotiff(tmp_path / "zero.tif", *layers, nodata=0), "--missing-is-unburnt"),
         (netcdf(tmp_path / "fire.nc", times=[0, 600, 1200, 1800], mask=layers),),

@@ -79,6 +79,11 @@ def test_crossing_edges_are_repaired_and_times_may_be_numbers(
     assert len(world(file)) == 3
     local = ["2020-08-29T23:00:00-07:00", "2020-08-30T06:00:00Z", "2020-08-31T08:00:00+02:00"]
     assert len(world(perimeters(tmp_path / "c.gpkg", SQUARES, date=local))) == 2
+    slashes = ["2020/08/29 00:00:00.000", "2020/08/30 00:00:00.000", "2020/08/31 00:00:00.000"]
+    number = [1_599_264_000_000, 1_599_307_200_000, 1_599_350_400_000]
+    file = perimeters(tmp_path / "d.shp", SQUARES, DateCur=slashes, number=number)
+    assert len(world(file)) == 3
+    assert len(world(file, "--time-column=number", "--unit=ms")) == 2
 
 
 #: Words of the error, shapes, and columns.

@@ -54,7 +54,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
                     f"{group.path}/{name}".lstrip("/"): array
                     for group in tree.subtree
                     for name, array in group.data_vars.items()
-                    if array.ndim > 1 and array.dtype.kind in "iufc"
+                    if array.ndim > 1 and array.dtype.kind in "biufc"
                 }
                 name = choose_variable(file, list(arrays), choice.variable)
                 yield from _layers(file, arrays[name], choice)

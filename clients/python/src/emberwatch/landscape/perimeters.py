@@ -21,7 +21,7 @@ from emberwatch.landscape.libraries import library
 from emberwatch.landscape.schedule import SINCE_1970, Clock
 
 _MARGIN: Final = 0.1  # unburnt land around the fire, as a share of its longer side
-_DATE: Final = re.compile(r"\d{4}-?\d\d-?\d\d")
+_DATE: Final = r"\d{4}([-/]?)(?:0[1-9]|1[0-2])\1[0-3]\d(?!\d)"
 _ZONE: Final = re.compile(r":.*(?:Z|[+-]\d\d(?::?\d\d)?)$")
 
 
@@ -122,7 +122,7 @@ def _times(file: Path, columns: Any, wanted: str | None) -> tuple[Any, Clock, li
     known = ", ".join(map(str, columns)) or "none"
     if wanted is not None and wanted not in columns:
         raise invalid("--time-column", f"a column of {file} ({known})", f"'{wanted}'")
-    words = {name: columns[name].fillna("").astype(str) for name in columns}
+    words = {name: columns[name].astype(object).fillna("").astype(str) for name in columns}
     dated = [name for name, column in words.items() if column.str.match(_DATE).any()]
     if wanted is None and len(dated) != 1:
         got = f"{len(dated)} ({', '.join(map(str, dated)) or known}); choose with --time-column"
@@ -130,7 +130,7 @@ def _times(file: Path, columns: Any, wanted: str | None) -> tuple[Any, Clock, li
     name = dated[0] if wanted is None else wanted
     if name not in dated and columns[name].dtype.kind in "if":
         return columns[name].to_numpy(np.float64), Clock(), []
-    seconds = seconds_of(f"{file}, {name}", words[name])
+    seconds = seconds_of(f"{file}, {name}", words[name].str.replace("/", "-"))
     zoned = words[name].str.contains(_ZONE)
     if zoned.any() and not zoned.all():
         got = f"'{words[name][zoned].iloc[0]}' and '{words[name][~zoned].iloc[0]}'"
