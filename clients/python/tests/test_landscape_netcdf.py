@@ -199,9 +199,8 @@ def test_a_grid_mapping_is_the_projection(tmp_path: Path) -> None:
     place = {"corner": (500_000, 4_000_090)}
     wkt = rasterio.open(geotiff(folder / "0.tif", MASKS[0], nodata=None, **place)).crs.to_wkt()
     mapping = Variable(0, "i4", (), {"grid_mapping_name": "transverse_mercator", "crs_wkt": wkt})
-    other = Variable(0, "i4", (), {"grid_mapping_name": "latitude_longitude"})
-    mask = Variable(MASKS[2], "u1", ("y", "x"), {"grid_mapping": "other: lat lon crs: x y"})
-    written(folder / "1.nc", **grid(mask), crs=mapping, other=other)
+    mask = Variable(MASKS[2], "u1", ("y", "x"), {"grid_mapping": "crs"})
+    written(folder / "1.nc", **grid(mask), crs=mapping)
     np.testing.assert_array_equal(imported(folder, 3), MASKS[[0, 2]])
 
 

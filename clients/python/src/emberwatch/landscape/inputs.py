@@ -30,11 +30,10 @@ _AUXILIARY: Final = (".prj", ".tfw", ".xml", ".dbf", ".shx", ".cpg")
 
 
 class Stack(NamedTuple):
-    """The files of a sequence, in order."""
+    """The files of a sequence, and a note on their order in a folder."""
 
     files: list[Path]
     notes: tuple[str, ...] = ()
-    """The order of a folder's files."""
 
 
 def stacks(inputs: Sequence[Path], *, one_file_each: bool, order: str | None = None) -> list[Stack]:
@@ -67,10 +66,9 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool, order: str | None = N
     if not one_file_each:
         return found
     return [
-        Stack([file], () if k else stack.notes)
-        for stack in found
-        for k, file in enumerate(stack.files)
-    ]
+        Stack([file], () if file != stack.files[0] else stack.notes)
+        for stack in found for file in stack.files
+    ]  # fmt: skip
 
 
 def read(files: Sequence[Path], choice: Choice) -> Generator[Layer]:

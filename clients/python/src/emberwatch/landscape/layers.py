@@ -54,8 +54,7 @@ def window(
 ) -> tuple[NDArray[np.floating], Place]:
     """Reads the chosen window of an array (rows, columns) whose first cell is the north-west one.
 
-    Returns the values, NaN for `choice.nodata`, and the grid of the window. Strips of rows are read
-    one after the other, so that only the result is in memory.
+    Returns the values, NaN for `choice.nodata`, and their grid. Reads strips of rows one by one.
     """
     (rows, columns), cut = crop(place, choice.crop)
     height, width = cut.shape

@@ -3,7 +3,7 @@
 import math
 import re
 import warnings
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -153,18 +153,15 @@ def _place(file: Path, array: Any, rows: str, columns: str) -> tuple[Place, tupl
         if {rows, columns} <= {*one.dims} and _stated(file, one) in ("X", "Y"):
             got = f"{one.name} with {', '.join(one.dims)}; reproject it"
             raise invalid(file, "coordinates with one dimension", got)
-    mapping = _mapping(array, columns)
     (west, width), (south, height) = (
         (0.0, 1.0) if one is None else _line(file, one) for one in (x, y)
     )
     turned = slice(None, None, 1 if height < 0 else -1), slice(None, None, -1 if width < 0 else 1)
     if x is None or y is None:
         return Place(shape=shape), turned
-    units = [unit for unit in (_unit(file, one, mapping) for one in (x, y)) if unit]
+    units = [unit for unit in (_unit(file, array, one) for one in (x, y)) if unit]
     length, is_angle = units[0] if units else (1.0, False)
-    projection = _projection(file, mapping)
-    if is_angle and projection is None:
-        projection = library("pyproj", file).CRS("EPSG:4326").to_wkt()
+    projection = _projection(file, array, is_angle=is_angle)
     known = (unit_of(projection) if projection else None) or (1.0, is_angle)
     if any(unit[1] != known[1] for unit in units):
         expected, got = ("degrees", "metres") if known[1] else ("metres", "degrees")
@@ -197,13 +194,14 @@ def _line(file: Path, one: Any) -> tuple[float, float]:
     return float(min(at[0], at[-1])), step
 
 
-def _unit(file: Path, one: Any, mapping: Mapping[str, Any]) -> tuple[float, bool] | None:
+def _unit(file: Path, array: Any, one: Any) -> tuple[float, bool] | None:
     """Returns a unit's length in metres or radians, and whether it is an angle."""
     unit, name = (str(one.attrs.get(key, "")).strip().lower() for key in ("units", "standard_name"))
     if unit.startswith("degree") or (not unit and "itude" in name):
         return _DEGREES
-    if unit in ("rad", "radian", "radians") and "perspective_point_height" in mapping:
-        return float(mapping["perspective_point_height"]), False  # of a geostationary satellite
+    if unit in ("rad", "radian", "radians"):  # of a geostationary satellite
+        mapping = array.coords.get(array.encoding.get("grid_mapping"))
+        return float(mapping.attrs["perspective_point_height"]), False
     if unit in ("", "1") and one.name.lower() not in _ANGLES:
         return None
     known = unit_named(unit)
@@ -212,29 +210,17 @@ def _unit(file: Path, one: Any, mapping: Mapping[str, Any]) -> tuple[float, bool
     return METRES[known], False
 
 
-def _mapping(array: Any, columns: str) -> Mapping[str, Any]:
-    """Returns the attributes of the grid mapping; if there are several, of the columns' mapping."""
-    text = str(array.encoding.get("grid_mapping", ""))
-    names = re.split(r"(\S+):", text)[1:]  # such as "name: x y other: lat lon"
-    several = {of: name for name, of in zip(names[::2], names[1::2], strict=True)}
-    name = next((name for of, name in several.items() if columns in of.split()), text)
-    return array.coords[name].attrs if name in array.coords else {}
-
-
-def _projection(file: Path, mapping: Mapping[str, Any]) -> str | None:
-    """Returns the projection as well-known text.
-
-    A grid mapping that pyproj does not know becomes a list of its attributes, for comparisons only.
-    """
-    if not mapping:
-        return None
-    name = mapping.get("grid_mapping_name", "grid mapping")
+def _projection(file: Path, array: Any, *, is_angle: bool) -> str | None:
+    """Returns the projection as well-known text; degrees without one refer to WGS 84."""
+    name = array.encoding.get("grid_mapping", "")
+    if ":" in name:
+        raise invalid(file, "one grid mapping", f"'{name}'")
+    if name not in array.coords:
+        return library("pyproj", file).CRS("EPSG:4326").to_wkt() if is_angle else None
     try:
-        crs = library("pyproj", file).CRS.from_cf({"projected_crs_name": name} | dict(mapping))
-        return crs.to_wkt()
-    except Exception:  # pyproj may raise any error for unexpected attributes
-        words = ", ".join(f"{key} {value}" for key, value in sorted(mapping.items()))
-        return f'"{name}" {words}'
+        return library("pyproj", file).CRS.from_cf(array.coords[name].attrs).to_wkt()
+    except Exception as error:  # pyproj may raise any error for unexpected attributes
+        raise invalid(f"{file}, {name}", "a grid mapping of CF", error) from None
 
 
 def _times(file: Path, array: Any, dimension: str | None) -> list[Time]:

@@ -91,14 +91,11 @@ def _bands(file: Path, source: Any, choice: Choice) -> tuple[Sequence[int], int]
 def _place(file: Path, source: Any) -> Place:
     """Returns the grid of a file. If the transform is the identity, the file has no position."""
     (height, width), transform, crs = source.shape, source.transform, source.crs
-    # The skew is measured over the whole grid, because rotations by tiny angles are rounding
-    # errors.
-    skewed = abs(transform.b) * height, abs(transform.d) * width
-    is_rotated = skewed[0] > LIKE * abs(transform.a) or skewed[1] > LIKE * abs(transform.e)
-    if is_rotated or source.gcps[0]:
-        raise invalid(
-            file, "rows from west to east", "a rotated grid; reproject it (gdalwarp -t_srs)"
-        )
+    # Measured over the whole grid, because rotations by tiny angles are rounding errors.
+    skewed = abs(transform.b) * height > LIKE * abs(transform.a)
+    if skewed or abs(transform.d) * width > LIKE * abs(transform.e) or source.gcps[0]:
+        got = "a rotated grid; reproject it (gdalwarp -t_srs)"
+        raise invalid(file, "rows from west to east", got)
     if transform.is_identity:
         return Place(shape=source.shape)
     east, south = transform.c + transform.a * width, transform.f + transform.e * height
