@@ -89,13 +89,17 @@ def schedule(times: list[Time], *, step: float, every: int, unit: str | None) ->
     after = [time.value * length for time, length in zip(times, lengths, strict=True)]
     seconds = np.array(after) + [time.clock.epoch() or 0.0 for time in times]
     gaps = np.diff(seconds)
-    for k in np.flatnonzero(gaps <= 0)[:1]:
-        before, got = (times[i].clock.date(after[i]) or f"{times[i].value:.6g}" for i in (k, k + 1))
-        raise invalid(times[k + 1].name, f"a later time than {before}", got)
-    for k in [] if has_unit else np.flatnonzero(np.abs(gaps - gaps[:1]) > _EVEN * gaps[:1])[:1]:
-        got = f"{gaps[k]:.6g}; to allow this, give the unit of times with --unit"
+    late = np.append(np.flatnonzero(gaps <= 0), -1).tolist()[0]
+    if late >= 0:
+        before, got = (
+            times[k].clock.date(after[k]) or f"{times[k].value:.6g}" for k in (late, late + 1)
+        )
+        raise invalid(times[late + 1].name, f"a later time than {before}", got)
+    uneven = np.append(np.flatnonzero(np.abs(gaps - gaps[:1]) > _EVEN * gaps[:1]), -1).tolist()[0]
+    if uneven >= 0 and not has_unit:
+        got = f"{gaps[uneven]:.6g}; to allow this, give the unit of times with --unit"
         expected = f"times {gaps[0]:.6g} apart, like the first ones"
-        raise invalid(times[k + 1].name, expected, got)
+        raise invalid(times[uneven + 1].name, expected, got)
     if not has_unit:
         return without_times(len(times), every)
     if every != 1:
