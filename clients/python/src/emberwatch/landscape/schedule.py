@@ -88,18 +88,17 @@ def schedule(times: list[Time], *, step: float, every: int, unit: str | None) ->
     lengths = [SECONDS[each or "s"] for each in units]
     after = [time.value * length for time, length in zip(times, lengths, strict=True)]
     seconds = np.array(after) + [time.clock.epoch() or 0.0 for time in times]
-    gaps = np.diff(seconds)
-    late = np.append(np.flatnonzero(gaps <= 0), -1).tolist()[0]
-    if late >= 0:
-        before, got = (
-            times[k].clock.date(after[k]) or f"{times[k].value:.6g}" for k in (late, late + 1)
-        )
-        raise invalid(times[late + 1].name, f"a later time than {before}", got)
-    uneven = np.append(np.flatnonzero(np.abs(gaps - gaps[:1]) > _EVEN * gaps[:1]), -1).tolist()[0]
-    if uneven >= 0 and not has_unit:
-        got = f"{gaps[uneven]:.6g}; to allow this, give the unit of times with --unit"
-        expected = f"times {gaps[0]:.6g} apart, like the first ones"
-        raise invalid(times[uneven + 1].name, expected, got)
+    gaps: list[float] = np.diff(seconds).tolist()
+    for k, gap in enumerate(gaps, start=1):
+        if gap <= 0:
+            before, got = (
+                times[i].clock.date(after[i]) or f"{times[i].value:.6g}" for i in (k - 1, k)
+            )
+            raise invalid(times[k].name, f"a later time than {before}", got)
+        if not has_unit and abs(gap - gaps[0]) > _EVEN * gaps[0]:
+            got = f"{gap:.6g}; to allow this, give the unit of times with --unit"
+            expected = f"times {gaps[0]:.6g} apart, like the first ones"
+            raise invalid(times[k].name, expected, got)
     if not has_unit:
         return without_times(len(times), every)
     if every != 1:
