@@ -101,6 +101,14 @@ def test_classes_of_fuel_have_their_factors(tmp_path: Path) -> None:
     assert maps(tmp_path)["fuel"].tolist() == [[2.5, 2.5, 1], [0, 2.5, 0]]
     no_fly = Model.named(tmp_path / "new" / "land.toml").no_fly
     assert no_fly is not None and no_fly.tolist() == [[0, 0, 1], [0, 0, 1]]
+    fuel = geotiff(fuel, [[1, 1, -9999], [2, -9999, 2]], nodata=-9999, dtype="int16")
+    made(tmp_path, "--fuel", fuel, "--missing-class=0", "--unburnable=0")
+    assert maps(tmp_path)["fuel"].tolist() == [[1, 1, 0], [1, 0, 1]]
+    towns = geotiff(tmp_path / "towns.tif", [[255, 1, 1], [255, 1, 255]], nodata=255)
+    made(tmp_path, "--no-fly", towns)
+    no_fly = Model.named(tmp_path / "new" / "land.toml").no_fly
+    assert no_fly is not None and no_fly.tolist() == [[0, 1, 1], [0, 1, 0]], "no value: free"
+    geotiff(fuel, values, nodata=None)
     dem = array(tmp_path / "z.npy", [[0.0, 10.0, 20.0]] * 2)
     made(tmp_path, dem, "--cell=30", *flags)
     assert set(maps(tmp_path)) == {"fuel", "slope_wind"}

@@ -104,7 +104,7 @@ REFUSED: list[tuple[str, list[Any], dict[str, Any]]] = [
     ("expected at least 2 steps, got 1", SQUARES[:1], {}),
     ("centres of cells in perimeters, got none in the first perimeters; use a smaller --cell",
         [box(WEST + 1, SOUTH + 1, WEST + 9, SOUTH + 9), SQUARES[0]], {}),
-    ("perimeters on at most 134217728 cells, got", [SQUARES[0], box(0, 0, 9e6, 9e6)], {}),
+    ("perimeters on at most 268435456 cells, got", [SQUARES[0], box(0, 0, 9e6, 9e6)], {}),
     ("expected shapes in a zone of UTM", [box(0, 89, 1, 95)], {"crs": "EPSG:4326"}),
     ("fire.gpkg: expected perimeters, got:", [], {}),
 ]  # fmt: skip

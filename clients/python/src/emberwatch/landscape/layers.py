@@ -12,7 +12,7 @@ from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place, crop
 from emberwatch.landscape.schedule import Clock, Time
 
-MOST_CELLS: Final = 1 << 27  # maximum number of used cells of a layer: 1 GiB of doubles
+MOST_CELLS: Final = 1 << 28  # maximum number of used cells of a layer: 1 GiB of 32-bit numbers
 _STRIP: Final = 1 << 22  # number of cells that are read at once
 _ROUNDED: Final = float(np.finfo(np.float32).eps)  # relative tolerance for `nodata` numbers
 
@@ -59,7 +59,7 @@ def window(
     (rows, columns), cut = crop(place, choice.crop)
     height, width = cut.shape
     if height * width > MOST_CELLS:
-        raise invalid(name, f"at most {MOST_CELLS} cells; use --crop", f"{height} x {width}")
+        raise invalid(name, f"at most {MOST_CELLS} cells", f"{height} x {width}; use --crop")
     values = np.empty(cut.shape, np.promote_types(array.dtype, np.float32))
     strip = max(1, _STRIP // width)
     for top in range(0, height, strip):
