@@ -125,7 +125,7 @@ CASES: list[tuple[str, Case]] = [
         lambda f: (*days(f, "hours since 2020-08-01", "hours since start"), *MASKS)),
     ("--every: expected only with layers without times, got 2: ",
         lambda f: (days(f, "hours", None)[0], *MASKS, "--every", 2)),
-    ("has no times, got --unit s; leave the flag out",
+    ("expected the time of the layer, got none; leave out --unit s",
         layers(MASKS, NONE, ONE, flags=("--unit", "s"))),
     ("--unit: expected h, as in ", lambda f: (days(f, "hours", None)[0], *MASKS, "--unit", "s")),
     ("band 2: expected 0 and only one other number in all layers, 1, got 2 in row 0, column 0",

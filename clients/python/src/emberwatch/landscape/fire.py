@@ -24,15 +24,7 @@ from emberwatch.landscape.grid import (
     target_shape,
 )
 from emberwatch.landscape.layers import Layer, check_full, where
-from emberwatch.landscape.schedule import (
-    SECONDS,
-    Time,
-    check_timed,
-    schedule,
-    steps_at,
-    unit_of,
-    without_times,
-)
+from emberwatch.landscape.schedule import SECONDS, Time, schedule, steps_at, unit_of
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 
@@ -205,14 +197,8 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
         burnt[(state == BURNT) & np.isinf(burnt)] = k
     if first is None:
         raise invalid("layers", "at least 2", "none")
-    check_timed(names, stamps)
-    if stamps:
-        times = schedule(stamps, step=meaning.seconds, every=meaning.every, unit=meaning.unit)
-    elif meaning.unit is None:
-        times = without_times(len(names), meaning.every)
-    else:
-        got = f"--unit {meaning.unit}; leave the flag out"
-        raise InvalidArgumentError(f"--unit: {names[0]} has no times, got {got}")
+    step, every, unit = meaning.seconds, meaning.every, meaning.unit
+    times = schedule(names, stamps, step=step, every=every, unit=unit)
     if np.isinf(arrival).all():
         raise invalid(first.name, "cells that burn", "none")
     is_mask = meaning.kind == "mask"

@@ -74,12 +74,21 @@ class Schedule(NamedTuple):
     begin: str | None = None
 
 
-def schedule(times: list[Time], *, step: float, every: int, unit: str | None) -> Schedule:
+def schedule(
+    names: list[str], times: list[Time], *, step: float, every: int, unit: str | None
+) -> Schedule:
     """Computes the steps of layers, whose times must increase.
 
     `step` is in seconds. `unit` is the unit of the times; None for the files' unit. Layers without
-    a unit of times are evenly spaced, and make a step of `every` layers.
+    a unit of times are evenly spaced, and make a step of `every` layers, which shows the last.
     """
+    without = Schedule(steps_at(np.arange(len(names)), every))
+    if not times and unit is None:
+        return without
+    if len(times) < len(names):
+        untimed = next(name for name in names if name not in {time.name for time in times})
+        got = f"none, unlike {times[0].name}" if times else f"none; leave out --unit {unit}"
+        raise invalid(untimed, "the time of the layer", got)
     first = times[0]
     for time in times:
         _check_clock(time.name, time.clock, first.name, first.clock)
@@ -100,18 +109,13 @@ def schedule(times: list[Time], *, step: float, every: int, unit: str | None) ->
             expected = f"times {gaps[0]:.6g} apart, like the first ones"
             raise invalid(times[k].name, expected, got)
     if not has_unit:
-        return without_times(len(times), every)
+        return without
     if every != 1:
         got = f"{every}: {first.name} has times, and --step chooses among them"
         raise invalid("--every", "only with layers without times", got)
     rounding = max(time.rounding for time in times) * lengths[0]
     steps = steps_at(seconds - seconds[0], step, rounding, first.name)
     return Schedule(steps, first.clock.date(after[0]))
-
-
-def without_times(n_layers: int, every: int) -> Schedule:
-    """Returns the steps of layers of which `every` make a step, which shows the last of them."""
-    return Schedule(steps_at(np.arange(n_layers), every))
 
 
 def length(text: str) -> float:
@@ -156,17 +160,6 @@ def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
         got = f"'{words}'; give the unit with --unit"
         raise invalid(name, "times in days or smaller units", got)
     return wanted or in_file
-
-
-def check_timed(names: list[str], times: list[Time]) -> None:
-    """Refuses layers of which only some have times."""
-    if times and len(times) < len(names):
-        timed = {
-            time.name: f"times in '{time.clock.words}' ({time.clock.calendar})" for time in times
-        }
-        name = next(name for name in names if (name in timed) != (names[0] in timed))
-        expected = f"{timed.get(names[0], 'no time')} as in {names[0]}"
-        raise invalid(name, expected, timed.get(name, "no time"))
 
 
 def _check_clock(name: str, clock: Clock, first_name: str, first: Clock) -> None:
