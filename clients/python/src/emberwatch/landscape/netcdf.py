@@ -7,12 +7,12 @@ from collections.abc import Generator, Iterator
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.ground import unit_of
@@ -45,11 +45,13 @@ _EVEN: Final = 0.1  # tolerance for positions, as a share of a cell, as 32-bit n
 def read(file: Path, choice: Choice) -> Generator[Layer]:
     """Yields a layer for each time of a variable. The file is closed after the last layer."""
     xarray, _ = library("xarray", file), library("netCDF4", file)
-    path = utf8("file", file.absolute())
     options = {"decode_times": False, "decode_coords": "all", "cache": False}
-    with warnings.catch_warnings(action="ignore"):
+    with warnings.catch_warnings(action="ignore"), TemporaryDirectory() as folder:
+        # xarray decodes paths by the locale; this one is plain.
+        link = Path(folder, "input.nc")
+        link.symlink_to(file.absolute())
         try:
-            with closing(xarray.open_datatree(path, engine="netcdf4", **options)) as tree:
+            with closing(xarray.open_datatree(link, engine="netcdf4", **options)) as tree:
                 arrays = {
                     f"{group.path}/{name}".lstrip("/"): array
                     for group in tree.subtree
