@@ -1,13 +1,13 @@
 """Recorded worlds from rasters of fires: `python -m emberwatch.landscape IN... --out world.npz`.
 
-Reading rasters needs ``pip install emberwatch[landscape]``. `inputs` finds the files. `raster`
-(with rasterio), `netcdf` (with netCDF4; `axes` and `packing` apply the CF conventions) and
-`numpy_file` read the files as `layers`. `schedule` computes the time of each layer, `ground` the
+Reading needs ``pip install emberwatch[landscape]``. `inputs` finds the files, and `order` sorts
+them. `raster` (rioxarray), `netcdf` (xarray), `numpy_file`, `perimeters` and `detections`
+(geopandas) read the files as `layers`. `schedule` computes the time of each layer, `ground` the
 size of cells on the ground (with pyproj). `lengths` defines units, `grid` checks positions and
 resamples. `fire` converts times, masks or codes to states, `world` writes the files for
 `emberwatch-server --states`, `picture` draws the states, and `__main__` parses the flags.
 
 `python -m emberwatch.landscape land` makes model files with maps. `elevation` computes slopes,
 `terrain` implements the formula for slope and wind and writes the model file, `compass` parses
-directions, and `land` parses the flags.
+directions, and `land` parses the flags. `flags` holds what both commands parse.
 """

@@ -5,7 +5,7 @@ import math
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from datetime import datetime
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -17,37 +17,36 @@ from emberwatch.common.output import end_with_reader
 from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape import land
-from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
-from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
+from emberwatch.landscape.fire import BURNING, BURNT, KINDS, UNBURNT, Meaning, states, times
+from emberwatch.landscape.flags import add_common, of_flags, several, whole
+from emberwatch.landscape.grid import Place, check_alike
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice
 from emberwatch.landscape.lengths import side
+from emberwatch.landscape.order import ORDERS
 from emberwatch.landscape.schedule import length
 from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
 
 _NAME: Final = "python -m emberwatch.landscape"
-_EXAMPLES: Final = """
-examples:
-  # Arrival times in seconds (as from ELMFIRE); a cell burns for 6 steps of 10 minutes:
-  python -m emberwatch.landscape time_of_arrival.tif --kind arrival --unit s --step "10 min" \\
-      --burning 6 --cell 120 --out world.npz
-  # Masks of all cells that have burnt so far, one file for each time:
-  python -m emberwatch.landscape folder --kind mask --step "1 h" --burning 3 --height 64 \\
-      --out world.npz
-  # A NetCDF variable of the codes 0, 1, 2 with a time dimension:
-  python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" \\
-      --out world.npz
-
-`python -m emberwatch.landscape land` makes a model file from elevation, wind and fuel.
-"""
 #: Flags that apply only to some values of `--kind`.
 _ONLY_FOR: Final = {
     "begin": ("arrival",),
+    "year_days": ("arrival",),
+    "time_column": ("arrival",),
     "burning": ("arrival", "mask"),
     "codes": ("states",),
     "every": ("mask", "burning", "states"),
     "missing_is_unburnt": ("mask", "burning", "states"),
 }
+
+_CODES: Final = several(
+    float,
+    "three different numbers",
+    lambda it: np.isfinite(it).all() and len(it) == len({*it}) == 3,
+)
+_CROP: Final = several(
+    int, "TOP,LEFT,HEIGHT,WIDTH, four whole numbers", lambda it: len(it) == 4 and 0 <= min(it)
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -70,65 +69,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a recorded world for `emberwatch-server --states` from rasters: GeoTIFF "
-        "(.tif), ESRI ASCII grid (.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md "
-        "describes all rules.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Make a recorded world for `emberwatch-server --states` from rasters, "
+        "perimeters or detections of a fire. docs/landscapes.md describes formats and flags.",
+        epilog="`python -m emberwatch.landscape land` makes a model from elevation, wind and fuel.",
     )
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="IN", help="files, or a folder for each sequence")
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE.npz",
-        help="the output; its description goes to FILE.toml",
-    )
-    add(
-        "--kind",
-        required=True,
-        choices=("arrival", "mask", "burning", "states"),
-        help="arrival: one file for each fire, with the times at which cells begin to burn; mask: "
-        "layers of all cells that have burnt so far; burning: layers of the cells that burn at "
-        "this time; states: layers of codes",
-    )
+    add("--out", type=Path, required=True, metavar="FILE.npz", help="also writes FILE.toml")
+    add("--kind", required=True, choices=KINDS, help="meaning of the numbers in the files")
     add("--step", required=True, metavar="TIME", help="duration of a step, such as '10 min'")
-    add("--unit", choices=("s", "min", "h", "d"), help="unit of times in the files [the file's]")
+    add("--unit", choices=("ms", "s", "min", "h", "d"), help="unit of times [the file's]")
     add("--begin", type=float, metavar="X", help="arrival time of step 0 [the earliest]")
-    add("--burning", type=_whole, metavar="N", help="steps that a cell burns (arrival, mask)")
-    add("--every", type=_whole, metavar="N", help="make a step of every N-th layer [1]")
-    add("--codes", type=_codes, metavar="U,B,D", help="codes of unburnt, burning, burnt [0,1,2]")
-    add("--variable", metavar="NAME", help="the variable, if a NetCDF or .npz file has several")
-    add("--band", type=_whole, metavar="N", help="the only band to read from each file [all]")
-    add(
-        "--nodata",
-        type=float,
-        action="append",
-        metavar="X",
-        help="a number that means no value; if negative with an exponent, write --nodata=-1e30",
-    )
-    add("--missing-is-unburnt", action="store_true", help="treat cells without a value as unburnt")
-    add("--crop", type=_crop, metavar="TOP,LEFT,HEIGHT,WIDTH", help="part of the input to use")
-    add("--height", type=_whole, metavar="N", help="rows of the world [the input's]")
-    add("--width", type=_whole, metavar="N", help="columns of the world [the input's]")
-    add(
-        "--cell",
-        metavar="METRES",
-        help="side of the world's cells instead of rows and columns, such as 30 or '98.4 ft'",
-    )
-    add(
-        "--resample",
-        choices=("earliest", "nearest"),
-        default="earliest",
-        help="when a larger cell burns: with the first of its input cells, or with the middle one "
-        "[earliest]",
-    )
+    add("--year-days", type=whole, metavar="N", help="days of the year before New Year")
+    add("--burning", type=whole, metavar="N", help="steps that a cell burns (arrival, mask)")
+    add("--every", type=whole, metavar="N", help="make a step of every N-th layer [1]")
+    add("--codes", type=_CODES, metavar="U,B,D", help="codes of unburnt, burning, burnt [0,1,2]")
+    add("--crop", type=_CROP, metavar="TOP,LEFT,HEIGHT,WIDTH", help="part of the input to use")
+    add("--height", type=whole, metavar="N", help="rows of the world [the input's]")
+    add("--width", type=whole, metavar="N", help="columns of the world [the input's]")
+    add("--cell", metavar="METRES", help="side of the world's cells, such as 30 or '98.4 ft'")
+    add("--resample", choices=("earliest", "nearest"), default="earliest", help="[earliest]")
     add("--oblong", action="store_true", help="treat cells that are not square as squares")
     add("--mixed", action="store_true", help="allow sequences whose cells differ on the ground")
-    add("--name", help="name of the world [the output file's]")
+    add("--missing-is-unburnt", action="store_true", help="cells without a value are unburnt")
+    add("--time-column", metavar="NAME", help="column with the times of perimeters")
+    add("--order", choices=ORDERS, help="numbers or dates by which a folder's files are sorted")
     add("--picture", type=Path, metavar="FILE.png", help="draw the result")
-    add("--force", action="store_true", help="replace the output")
+    add_common(parser)
     return parser
 
 
@@ -138,18 +105,20 @@ def _import(flags: argparse.Namespace) -> None:
     check_outputs(flags.out, flags.picture, force=flags.force)
     if flags.picture is not None and find_spec("PIL") is None:
         raise InvalidArgumentError("--picture: expected Pillow; pip install emberwatch[landscape]")
-    choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
-    sequences, begins = list[NDArray[np.uint8]](), list[datetime | None]()
+    is_arrival = meaning.kind == "arrival"
+    choice = of_flags(Choice, flags)
+    choice = choice if is_arrival else replace(choice, cell=None)
+    sequences, begins, notes = list[NDArray[np.uint8]](), list[str | None](), list[str]()
     first: Place | None = None
-    for stack in stacks(flags.inputs, one_file_each=meaning.kind == "arrival"):
-        with closing(read(stack, choice)) as layers:
+    for stack in stacks(flags.inputs, one_file_each=is_arrival, order=flags.order):
+        notes += stack.notes
+        with closing(read(stack.files, choice)) as layers:
             fire = times(layers, meaning)
-        shape = target_shape(fire.place, height=flags.height, width=flags.width, cell=flags.cell)
-        place = of_world(fire.place, shape)
-        first = first or place
-        check_alike(place, fire.name, first, mixed=flags.mixed)
-        sequences.append(states(fire, shape, flags.resample))
+        first = first or fire.place
+        check_alike(fire.place, fire.name, first, mixed=flags.mixed)
+        sequences.append(states(fire))
         begins.append(fire.begin)
+        notes += [f"{fire.name}: {note}" for note in fire.notes]
     text = description(name, flags.step, begins).encode()
     description_file = flags.out.with_suffix(".toml")
     contents: dict[Path, Fill] = {
@@ -162,6 +131,8 @@ def _import(flags: argparse.Namespace) -> None:
         image = draw(sequences, name)
         contents[flags.picture] = lambda file: image.save(file, "PNG")
     write(contents)
+    for note in notes:
+        print(shown(note))
     for states_of_fire in sequences:
         print(_summary(states_of_fire))
     if first is not None and flags.cell is not None and first.ground() is None:
@@ -191,18 +162,11 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
     if flags.begin is not None and not math.isfinite(flags.begin):
         raise invalid("--begin", "a number", flags.begin)
     flags.cell = None if flags.cell is None else side("--cell", flags.cell).metres
-    return Meaning(
-        kind=flags.kind,
-        step=length(flags.step),
-        unit=flags.unit,
-        begin=flags.begin,
-        burning=flags.burning or 1,
-        every=flags.every or 1,
-        crop=flags.crop,
-        codes=flags.codes or (0, 1, 2),
-        oblong=flags.oblong,
-        missing_is_unburnt=flags.missing_is_unburnt,
-    )
+    flags.nodata = tuple(flags.nodata or ())
+    flags.seconds = length(flags.step)
+    flags.burning, flags.every = flags.burning or 1, flags.every or 1
+    flags.codes = flags.codes or (UNBURNT, BURNING, BURNT)
+    return of_flags(Meaning, flags)
 
 
 def _summary(sequence: NDArray[np.uint8]) -> str:
@@ -213,32 +177,6 @@ def _summary(sequence: NDArray[np.uint8]) -> str:
         f"{n_steps} steps of {height} x {width} cells: at most {burning.max()} burn, "
         f"at step {burning.argmax()}; {100 * burnt:.1f} % have burnt at the end"
     )
-
-
-def _whole(text: str) -> int:
-    number = int(text) if text.isdecimal() and len(text) < 10 else 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number, 1 to 999999999, got {text}")
-    return number
-
-
-def _codes(text: str) -> tuple[float, ...]:
-    try:
-        codes = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        codes = ()
-    if len(codes) != BURNT + 1 or len(set(codes)) != len(codes) or not np.isfinite(codes).all():
-        raise argparse.ArgumentTypeError(f"expected three different numbers, got {text}")
-    return codes
-
-
-def _crop(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    if len(parts) != 4 or not all(part.isdecimal() and len(part) < 10 for part in parts):
-        raise argparse.ArgumentTypeError(
-            f"expected TOP,LEFT,HEIGHT,WIDTH, four whole numbers, got {text}"
-        )
-    return tuple(int(part) for part in parts)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Slopes of a raster of heights, with notes on the units that were assumed."""
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from emberwatch.errors import invalid
 from emberwatch.landscape.grid import check_even, check_square, check_unit
 from emberwatch.landscape.ground import unit_of, vertical_unit
-from emberwatch.landscape.layers import Layer
+from emberwatch.landscape.layers import Layer, check_full
 from emberwatch.landscape.lengths import METRES, NAMES, Side, unit_named
 from emberwatch.landscape.terrain import gradient
 
@@ -18,28 +18,24 @@ _FEET: Final = (0.3, 0.31)  # range of the lengths of all kinds of feet, metres
 _TURNED: Final = 5.0  # angle to true north above which a note is made, degrees
 
 
-class Slopes(NamedTuple):
-    """The slope of each cell."""
+def slopes(
+    layer: Layer, *, cell: Side | None, height_unit: str | None, oblong: bool
+) -> tuple[NDArray[np.float64], list[str]]:
+    """Returns the slope of each cell, as `gradient` does, and notes on units.
 
-    rise: NDArray[np.float64]
-    """Metres per metre to the east and to the north, shape (2, H, W)."""
-    notes: list[str]
-    """The units of cells and heights, and where they come from."""
-
-
-def slopes(layer: Layer, *, cell: Side | None, height_unit: str | None, oblong: bool) -> Slopes:
-    """Computes the slopes of a raster. Flags supply units that the raster does not state."""
+    Flags supply units that the raster does not state.
+    """
     (width, height), why = _sides(layer, cell, oblong=oblong)
     is_in_feet = _is_in_feet(layer, cell)
     metres, heights = _height_unit(layer, height_unit, is_in_feet=is_in_feet)
-    values = layer.values * metres
+    values = layer.values.astype(np.float64) * metres
     _check_heights(layer, values)
     rise = gradient(values, width, height)
     steepest = np.degrees(np.arctan(np.hypot(*rise).max()))
     notes = [
         f"cells of {width:.4g} x {height:.4g} metres{why}; steepest slope {steepest:.1f} degrees"
     ]
-    return Slopes(rise, [*notes, *_turned(layer), heights])
+    return rise, [*notes, *_turned(layer), heights]
 
 
 def _sides(layer: Layer, cell: Side | None, *, oblong: bool) -> tuple[tuple[float, float], str]:
@@ -95,12 +91,8 @@ def _height_unit(layer: Layer, wanted: str | None, *, is_in_feet: bool) -> tuple
 
 
 def _check_heights(layer: Layer, values: NDArray[np.float64]) -> None:
-    missing = np.argwhere(np.isnan(values))
-    if missing.size:
-        row, column = missing[0].tolist()
-        got = f"none in {len(missing)} cells, the first in row {row}, column {column}"
-        remedy = "fill them (gdal_fillnodata), or use a part (gdal_translate -srcwin)"
-        raise invalid(layer.name, "a height in each cell", f"{got}; {remedy}")
+    remedy = "fill them (gdal_fillnodata), or use a part (gdal_translate -srcwin)"
+    check_full(layer, "a height in each cell", remedy)
     wrong = values[(values < _HEIGHTS[0]) | (values > _HEIGHTS[1])]
     if wrong.size:
         expected = f"heights of {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} metres"

@@ -2,13 +2,13 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch._native import MAX_SIDE
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.landscape.ground import Ground, is_same, unit_cell
 
 LIKE: Final = 1e-3
@@ -64,13 +64,14 @@ class Place:
 
 
 def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
-    """Refuses a layer whose grid differs from the first layer's."""
-    if not is_same(place.projection, first.projection):
-        raise invalid(
-            name, f"the projection of {first_name}, {_projection(first)}", _projection(place)
-        )
+    """Refuses a layer whose grid differs from the first layer's; NumPy files have no positions."""
     if place.shape != first.shape:
         raise invalid(name, f"{_size(first)} cells as in {first_name}", _size(place))
+    if place.corner is None or first.corner is None:
+        return
+    if not is_same(place.projection, first.projection):
+        expected = f"the projection of {first_name}, {_projection(first)}"
+        raise invalid(name, expected, _projection(place))
     apart = np.subtract(_extent(place), _extent(first))
     if (np.abs(apart) > LIKE * first.cell[0]).any():
         raise invalid(name, f"the extent of {first_name}, {_extent(first)}", _extent(place))
@@ -85,10 +86,8 @@ def check_square(place: Place, name: str) -> None:
         got = f"rows and columns at {ground.angle:.0f} degrees"
     elif abs(ground.width / ground.height - 1) <= _SQUARE:
         return
-    raise InvalidArgumentError(
-        f"{name}: expected square cells, got {got}; reproject it (gdalwarp -t_srs), or treat them "
-        "as squares with --oblong"
-    )
+    remedy = "reproject it (gdalwarp -t_srs), or treat them as squares with --oblong"
+    raise invalid(name, "square cells", f"{got}; {remedy}")
 
 
 def check_even(place: Place, name: str) -> None:
@@ -100,11 +99,9 @@ def check_even(place: Place, name: str) -> None:
     found = [place.ground(down, right) or middle for down in shares for right in shares]
     sides = np.array([(one.width, one.height) for one in found])
     if (np.abs(sides / (middle.width, middle.height) - 1) > _SQUARE).any():
-        raise InvalidArgumentError(
-            f"{name}: expected cells of one size on the ground, got {sides.min():.6g} to "
-            f"{sides.max():.6g} metres; reproject it (gdalwarp -t_srs), use a part "
-            "(gdal_translate -srcwin), or treat all like the middle one with --oblong"
-        )
+        got = f"{sides.min():.6g} to {sides.max():.6g} metres; reproject it (gdalwarp -t_srs), use"
+        remedy = "a part (gdal_translate -srcwin), or treat all like the middle one with --oblong"
+        raise invalid(name, "cells of one size on the ground", f"{got} {remedy}")
 
 
 def check_unit(place: Place, subject: str, remedy: str) -> None:
@@ -114,9 +111,8 @@ def check_unit(place: Place, subject: str, remedy: str) -> None:
         got = "no projection, and coordinates that may be degrees"
     elif place.corner is not None and (place.projection is None or place.ground() is not None):
         return
-    raise invalid(
-        subject, "cells in metres, or a projection that gives their size", f"{got}; {remedy}"
-    )
+    expected = "cells in metres, or a projection that gives their size"
+    raise invalid(subject, expected, f"{got}; {remedy}")
 
 
 def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
@@ -125,25 +121,20 @@ def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
     `mixed` allows cells of another size or projection.
     """
     if place.shape != first.shape:
-        raise InvalidArgumentError(
-            f"{name}: expected {_size(first)} cells as in the first sequence, got {_size(place)}; "
-            "use --height and --width"
-        )
+        got = f"{_size(place)}; use --height and --width"
+        raise invalid(name, f"{_size(first)} cells as in the first sequence", got)
     if mixed:
         return
     has_place = place.corner is not None
     if not is_same(place.projection, first.projection) or has_place != (first.corner is not None):
-        raise InvalidArgumentError(
-            f"{name}: expected the projection of the first sequence, {_projection(first)}, got "
-            f"{_projection(place)}; --mixed allows both"
-        )
+        expected = f"the projection of the first sequence, {_projection(first)}"
+        raise invalid(name, expected, f"{_projection(place)}; --mixed allows both")
     sides = np.array([place.sides(), first.sides()])
-    if place.corner is not None and (np.abs(sides[0] / sides[1] - 1) > _SQUARE).any():
-        of_first, got = (f"{width:.6g} x {height:.6g}" for width, height in sides[::-1])
-        raise InvalidArgumentError(
-            f"{name}: expected cells of {of_first} on the ground as in the first sequence, got "
-            f"{got}; use --cell or --crop, or allow both with --mixed"
-        )
+    if has_place and (np.abs(sides[0] / sides[1] - 1) > _SQUARE).any():
+        got, of_first = (f"{width:.6g} x {height:.6g}" for width, height in sides)
+        remedy = "use --cell or --crop, or allow both with --mixed"
+        expected = f"cells of {of_first} on the ground as in the first sequence"
+        raise invalid(name, expected, f"{got}; {remedy}")
 
 
 def of_world(place: Place, shape: tuple[int, int]) -> Place:
@@ -153,35 +144,17 @@ def of_world(place: Place, shape: tuple[int, int]) -> Place:
     return replace(place, shape=shape, cell=(width, height))
 
 
-def part(place: Place, window: tuple[slice, slice]) -> Place:
-    """Returns the grid of a window of rows and columns."""
-    rows, columns = window
-    corner = place.corner and (
-        place.corner[0] + place.cell[0] * columns.start,
-        place.corner[1] - place.cell[1] * rows.start,
-    )
-    return replace(
-        place, shape=(rows.stop - rows.start, columns.stop - columns.start), corner=corner
-    )
-
-
-def crop(place: Place, wanted: tuple[int, ...] | None) -> tuple[slice, slice]:
-    """Checks a `--crop` window, and returns its rows and columns; None: all."""
-    height, width = place.shape
-    if wanted is None:
-        return slice(0, height), slice(0, width)
-    top, left, rows, columns = wanted
-    if (
-        min(top, left) < 0
-        or min(rows, columns) < 1
-        or top + rows > height
-        or left + columns > width
-    ):
-        raise InvalidArgumentError(
-            f"--crop: expected TOP,LEFT,HEIGHT,WIDTH within {height} x {width} cells, "
-            f"got {','.join(map(str, wanted))}"
-        )
-    return slice(top, top + rows), slice(left, left + columns)
+def crop(place: Place, wanted: tuple[int, ...] | None) -> tuple[tuple[slice, slice], Place]:
+    """Returns the rows and columns of a `--crop` window, and their grid; None: all."""
+    (height, width), corner = place.shape, place.corner
+    top, left, rows, columns = wanted or (0, 0, height, width)
+    if min(rows, columns) < 1 or top + rows > height or left + columns > width:
+        expected = f"TOP,LEFT,HEIGHT,WIDTH within {height} x {width} cells"
+        raise invalid("--crop", expected, f"{top},{left},{rows},{columns}")
+    if corner is not None:
+        corner = corner[0] + place.cell[0] * left, corner[1] - place.cell[1] * top
+    cut = replace(place, shape=(rows, columns), corner=corner)
+    return (slice(top, top + rows), slice(left, left + columns)), cut
 
 
 def target_shape(
@@ -193,29 +166,22 @@ def target_shape(
         check_unit(place, "--cell", "use --height")
         share = place.sides()[1] / cell
         height, width = max(1, round(rows * share)), max(1, round(columns * share))
-    elif height is None and width is None:
-        height, width = rows, columns
-    elif width is None:
-        width = max(1, round(columns * (height or 1) / rows))
-    elif height is None:
-        height = max(1, round(rows * width / columns))
-    height, width = height or 1, width or 1
+    elif height or width:
+        height = height or max(1, round(rows * (width or 1) / columns))
+        width = width or max(1, round(columns * height / rows))
+    height, width = height or rows, width or columns
     if max(height, width) > MAX_SIDE:
-        raise InvalidArgumentError(
-            f"grid: expected at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum, got "
-            f"{height} x {width}; use --height, --width, --cell or --crop"
-        )
+        got = f"{height} x {width}; use --height, --width, --cell or --crop"
+        raise invalid("grid", f"at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum", got)
     if not 1 - _SQUARE <= (columns / width) / (rows / height) <= 1 + _SQUARE:
-        raise InvalidArgumentError(
-            f"grid: expected the proportions of {rows} x {columns} cells, got {height} x {width}; "
-            "use --crop or another size"
-        )
+        got = f"{height} x {width}; use --crop or another size"
+        raise invalid("grid", f"the proportions of {rows} x {columns} cells", got)
     return height, width
 
 
 def resampled(
-    times: NDArray[np.float64], shape: tuple[int, int], rule: Rule, *, latest: bool = False
-) -> NDArray[np.float64]:
+    times: NDArray[np.floating[Any]], shape: tuple[int, int], rule: Rule, *, latest: bool = False
+) -> NDArray[np.floating[Any]]:
     """Resamples times to larger or smaller cells.
 
     With `"nearest"`, a cell gets the time of the input cell in its middle. With `"earliest"`, it

@@ -40,7 +40,9 @@ def unit_cell(projection: str, x: float, y: float) -> Ground | None:
     crs = _horizontal(projection)
     if crs is None:
         return None
-    base, unit = _base(crs), _factor(crs)
+    base, unit = crs, _factor(crs)
+    while base.source_crs is not None:  # latitudes and longitudes
+        base = base.source_crs
     if not base.is_geographic:  # an engineering CRS: a plane without a position on the Earth
         return Ground(unit, unit)
     step = _SHARE * (1.0 if crs.is_geographic else _RADIUS) / unit
@@ -99,13 +101,6 @@ def _horizontal(projection: str) -> Any | None:
     crs = _parsed(projection)
     while crs is not None and (crs.is_compound or crs.is_bound):
         crs = crs.sub_crs_list[0] if crs.is_compound else crs.source_crs
-    return crs
-
-
-def _base(crs: Any) -> Any:
-    """Returns the CRS of latitudes and longitudes that a projected or rotated CRS is based on."""
-    while crs.source_crs is not None:
-        crs = crs.source_crs
     return crs
 
 

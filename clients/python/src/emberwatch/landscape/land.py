@@ -16,28 +16,19 @@ from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.compass import POINTS, bearing
 from emberwatch.landscape.elevation import slopes
+from emberwatch.landscape.flags import add_common, several
 from emberwatch.landscape.grid import check_same
 from emberwatch.landscape.inputs import read, stacks
-from emberwatch.landscape.layers import Choice, Layer
+from emberwatch.landscape.layers import Choice, Layer, check_full
 from emberwatch.landscape.lengths import METRES, side
 from emberwatch.landscape.terrain import model_text, slope_and_wind
 from emberwatch.landscape.world import Fill, check_new, write
 
 _NAME: Final = "python -m emberwatch.landscape land"
-_EXAMPLES: Final = """
-examples:
-  # Fire climbs slopes, and follows a wind of 5 m/s to the east-north-east:
-  python -m emberwatch.landscape land dem.tif --wind-speed 5 --wind-towards 20 --out hills.toml
-  # Heights in feet, and a wind from the west-south-west:
-  python -m emberwatch.landscape land dem.tif --height-unit ft --wind-speed 5 --wind-from WSW \\
-      --out hills.toml
-  # Fuels, of which 3 burns twice as well as others and 7 and 8 never, and no-fly cells over towns:
-  python -m emberwatch.landscape land --fuel fuel.tif --factors 3=2 --unburnable 7,8 \\
-      --no-fly towns.tif --out fuels.toml
-"""
 _MOST_NUMBER: Final = 10**15  # maximum class of fuel; doubles represent all integers up to it
 _MOST_FACTOR: Final = 1e6  # maximum factor of a map
 _MOST_WIND: Final = 100.0  # maximum wind speed, m/s: more than any hurricane
+_CLASSES: Final = several(int, "whole numbers", bool)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -53,71 +44,23 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a model file with maps from rasters: GeoTIFF (.tif), ESRI ASCII grid "
-        "(.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/land.md describes the rules and "
-        "the formula.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Make a model file with maps from rasters. docs/land.md describes the flags.",
     )
     add = parser.add_argument
     add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE.toml",
-        help="the model file; its maps go to FILE.npz",
-    )
-    add(
-        "--cell",
-        metavar="METRES",
-        help="side of a cell on the ground, if the raster does not state it; '98.4 ft' for feet",
-    )
-    add(
-        "--height-unit",
-        choices=tuple(METRES),
-        help="unit of the heights [the raster's, or m]",
-    )
+    add("--out", type=Path, required=True, metavar="FILE.toml", help="its maps go to FILE.npz")
+    add("--cell", metavar="METRES", help="side of a cell, if the raster does not state it")
+    add("--height-unit", choices=tuple(METRES), help="unit of the heights [the raster's, or m]")
     add("--oblong", action="store_true", help="allow cells that are not square or differ in size")
     add("--wind-speed", type=float, default=0.0, metavar="M/S", help="speed of the wind [0]")
-    add(
-        "--wind-towards",
-        type=float,
-        metavar="DEGREES",
-        help="direction to which the wind blows, in degrees from the east towards the north: 0 is "
-        "to the east, 90 to the north",
-    )
-    add(
-        "--wind-from",
-        metavar="POINT|DEGREES",
-        help="instead of --wind-towards: where the wind comes from, as in weather reports: N, "
-        "NNE, ..., or degrees clockwise from the north",
-    )
+    add("--wind-towards", type=float, metavar="DEGREES", help="0 is to the east, 90 to the north")
+    add("--wind-from", metavar="POINT|DEGREES", help="instead, as in weather reports, such as NNE")
     add("--fuel", type=Path, metavar="RASTER", help="whole numbers, each a class of fuel")
-    add(
-        "--factors",
-        type=_factors,
-        metavar="N=X,N=X",
-        help="factors by which classes of --fuel multiply the hazard of fire [1]",
-    )
-    add("--unburnable", type=_classes, metavar="N,N", help="classes of --fuel that never burn")
-    add(
-        "--missing-class",
-        type=int,
-        metavar="N",
-        help="class of the cells that have no value in --fuel",
-    )
-    add(
-        "--no-fly",
-        type=Path,
-        metavar="RASTER",
-        help="cells with a number other than 0 are no-fly cells",
-    )
-    add("--variable", metavar="NAME", help="the variable, if a NetCDF or .npz file has several")
-    add("--band", type=int, metavar="N", help="the band, if a raster has several")
-    add("--nodata", type=float, action="append", metavar="X", help="a number that means no value")
-    add("--name", help="name of the model [the output file's]")
-    add("--force", action="store_true", help="replace the output")
+    add("--factors", type=_factors, metavar="N=X,N=X", help="factors of the hazard of classes [1]")
+    add("--unburnable", type=_CLASSES, metavar="N,N", help="classes of --fuel that never burn")
+    add("--missing-class", type=int, metavar="N", help="class of cells without a value in --fuel")
+    add("--no-fly", type=Path, metavar="RASTER", help="a number above 0 is a no-fly cell")
+    add_common(parser)
     return parser
 
 
@@ -127,20 +70,14 @@ def _make(flags: argparse.Namespace) -> None:
     check_new("--out", flags.out, force=flags.force)
     layers = _layers(flags)
     shape = next(iter(layers.values())).place.shape
-    slope = None
+    rise, notes = np.zeros((2, *shape)), list[str]()
     if "elevation" in layers:
-        slope = slopes(
-            layers["elevation"],
-            cell=flags.cell,
-            height_unit=flags.height_unit,
-            oblong=flags.oblong,
-        )
-    rise = np.zeros((2, *shape)) if slope is None else slope.rise
+        given = {"cell": flags.cell, "height_unit": flags.height_unit, "oblong": flags.oblong}
+        rise, notes = slopes(layers["elevation"], **given)
     maps = {"slope_wind": slope_and_wind(rise, flags.wind_speed, flags.wind_towards)}
     if "fuel" in layers:
         maps = {"fuel": _fuel(flags, layers["fuel"])} | maps
     maps = {key: _rounded(factors) for key, factors in maps.items() if (factors != 1.0).any()}
-    notes = [] if slope is None else slope.notes
     contents = _files(flags, maps, layers.get("no_fly"))
     files = {key: utf8("--out", file.name) for key, (file, _) in contents.items()}
     comments = "".join(f"# {line}\n" for line in (_origin(flags, layers), *notes))
@@ -160,9 +97,7 @@ def _check_flags(flags: argparse.Namespace) -> None:
     if flags.out.suffix != ".toml":
         raise invalid("--out", "a .toml file", flags.out)
     if (flags.elevation, flags.fuel, flags.no_fly) == (None, None, None):
-        raise InvalidArgumentError(
-            "rasters: expected at least one of ELEVATION, --fuel and --no-fly, got none"
-        )
+        raise invalid("rasters", "at least one of ELEVATION, --fuel and --no-fly", "none")
     needs = dict.fromkeys(("cell", "height_unit", "oblong"), "elevation")
     needs |= dict.fromkeys(("factors", "unburnable", "missing_class"), "fuel")
     for flag, needed in needs.items():
@@ -171,9 +106,7 @@ def _check_flags(flags: argparse.Namespace) -> None:
             word = "ELEVATION" if needed == "elevation" else "--fuel"
             raise InvalidArgumentError(f"--{flag.replace('_', '-')}: applies only with {word}")
     if flags.fuel is not None and (flags.factors, flags.unburnable) == (None, None):
-        raise InvalidArgumentError(
-            "--fuel: expected --factors or --unburnable with it, got neither"
-        )
+        raise invalid("--fuel", "--factors or --unburnable with it", "neither")
     flags.cell = None if flags.cell is None else side("--cell", flags.cell)
     if flags.missing_class is not None and abs(flags.missing_class) > _MOST_NUMBER:
         raise invalid("--missing-class", f"at most {_MOST_NUMBER}", flags.missing_class)
@@ -185,7 +118,7 @@ def _check_wind(flags: argparse.Namespace) -> None:
     if not 0.0 <= flags.wind_speed <= _MOST_WIND:
         raise invalid("--wind-speed", f"0 to {_MOST_WIND:g} m/s", flags.wind_speed)
     if None not in (flags.wind_towards, flags.wind_from):
-        raise InvalidArgumentError("wind: expected --wind-towards or --wind-from, got both")
+        raise invalid("wind", "--wind-towards or --wind-from", "both")
     if flags.wind_from is not None:
         degrees = bearing(flags.wind_from)
         if degrees is None or not -360.0 <= degrees <= 360.0:
@@ -193,10 +126,8 @@ def _check_wind(flags: argparse.Namespace) -> None:
             raise invalid("--wind-from", expected, f"'{flags.wind_from}'")
         flags.wind_towards = (270.0 - degrees) % 360.0
     if (flags.wind_speed > 0.0) != (flags.wind_towards is not None):
-        raise InvalidArgumentError(
-            "wind: expected both a --wind-speed above 0 and --wind-from (or --wind-towards), or "
-            "neither, got only one of them"
-        )
+        both = "both a --wind-speed above 0 and --wind-from (or --wind-towards)"
+        raise invalid("wind", f"{both}, or neither", "only one of them")
     flags.wind_towards = flags.wind_towards or 0.0
     if not -360.0 <= flags.wind_towards <= 360.0:
         raise invalid("--wind-towards", "-360 to 360 degrees", flags.wind_towards)
@@ -210,18 +141,9 @@ def _layers(flags: argparse.Namespace) -> dict[str, Layer]:
         file = getattr(flags, key)
         if file is not None:
             layers[key] = layer = _layer(file, choice)
-            _check_grid(layer, next(iter(layers.values())))
+            first = next(iter(layers.values()))
+            check_same(layer.place, layer.name, first.place, first.name)
     return layers
-
-
-def _check_grid(layer: Layer, first: Layer) -> None:
-    (height, width), (rows, columns) = first.place.shape, layer.place.shape
-    if (height, width) != (rows, columns):
-        expected = f"{height} x {width} cells as in {first.name}"
-        raise invalid(layer.name, expected, f"{rows} x {columns}")
-    # NumPy files do not state the positions of their cells.
-    if layer.place.corner is not None and first.place.corner is not None:
-        check_same(layer.place, layer.name, first.place, first.name)
 
 
 def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:
@@ -233,6 +155,8 @@ def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:
     if missing:
         expected = f"classes that occur in {flags.fuel}"
         raise invalid("--factors and --unburnable", expected, min(missing))
+    is_named = np.isin(layer.values, list(table))
+    _check_codes(layer, is_named, "give --nodata if it means no value, or name it in --factors")
     factors = np.array([table.get(one, 1.0) for one in classes.tolist()])
     return factors[places].reshape(layer.place.shape)
 
@@ -257,6 +181,8 @@ def _files(
             raise invalid("--out", expected, f"{n_values} values in {len(content)} bytes")
         files["maps"] = flags.out.with_suffix(".npz"), lambda file: file.write(content)
     if no_fly is not None:
+        remedy = "give --nodata if it means no value"
+        _check_codes(no_fly, np.zeros(no_fly.values.shape, np.bool_), remedy)
         # Cells without a value are free, because rasters made from polygons have none outside them.
         cells = np.nan_to_num(no_fly.values, nan=0.0) != 0.0
         if cells.all():
@@ -275,8 +201,8 @@ def _no_fly_summary(layer: Layer) -> str:
 
 
 def _layer(file: Path, choice: Choice) -> Layer:
-    (files,) = stacks([file], one_file_each=False)
-    with closing(read(files, choice)) as layers:
+    (stack,) = stacks([file], one_file_each=False)
+    with closing(read(stack.files, choice)) as layers:
         found = list(islice(layers, 2))
     if len(found) != 1:
         raise invalid(file, "one layer", "several; choose with --band" if found else "none")
@@ -288,14 +214,17 @@ def _layer(file: Path, choice: Choice) -> Layer:
     return layer
 
 
+def _check_codes(layer: Layer, is_named: NDArray[np.bool_], remedy: str) -> None:
+    """Refuses numbers below 0, which mostly mean "no value", unless a flag names them."""
+    wrong = layer.values[(layer.values < 0) & ~is_named]
+    if wrong.size:
+        raise invalid(layer.name, "numbers of at least 0", f"{wrong[0]:g}; {remedy}")
+
+
 def _whole(layer: Layer, missing_class: int | None) -> NDArray[np.int64]:
-    missing = np.isnan(layer.values)
-    if missing.any() and missing_class is None:
-        row, column = np.argwhere(missing)[0].tolist()
-        got = f"none in {missing.sum()} cells, the first in row {row}, column {column}"
-        remedy = "--missing-class N gives them the class N"
-        raise invalid(layer.name, "a number in each cell", f"{got}; {remedy}")
-    values = np.where(missing, missing_class or 0, layer.values)
+    if missing_class is None:
+        check_full(layer, "a number in each cell", "--missing-class N gives them the class N")
+    values = np.nan_to_num(layer.values, nan=missing_class or 0)
     wrong = values[(values % 1 != 0) | (np.abs(values) > _MOST_NUMBER)]
     if wrong.size:
         raise invalid(layer.name, "whole numbers, each a class of fuel", wrong[0])
@@ -307,13 +236,6 @@ def _origin(flags: argparse.Namespace, layers: dict[str, Layer]) -> str:
     files = ", ".join(ascii(getattr(flags, key).name) for key in layers)
     wind = f"{flags.wind_speed:g} m/s towards {flags.wind_towards:g} degrees"
     return f"{_NAME}: {files}; wind of {wind}"
-
-
-def _classes(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected whole numbers, got {text}") from None
 
 
 def _factors(text: str) -> dict[int, float]:

@@ -1,224 +1,261 @@
-"""Reader of NetCDF files.
-
-This module, `axes` and `packing` apply the CF conventions to a variable and its coordinates.
-Attributes that are not supported are refused by name.
-"""
+"""Reader of NetCDF files. xarray unpacks numbers; CF attributes state axes, times and the grid."""
 
 import math
-import os
+import re
+import warnings
 from collections.abc import Generator, Iterator
+from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.landscape.axes import Axis, auxiliary, axes_of, find, letter_of, line
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.ground import unit_of
-from emberwatch.landscape.layers import Choice, Layer, check_cells, choose_bands, choose_variable
+from emberwatch.landscape.layers import Choice, Layer, choose_bands, choose_variable, window
+from emberwatch.landscape.lengths import METRES, unit_named
 from emberwatch.landscape.libraries import library
-from emberwatch.landscape.packing import Attributes, attributes, unpacked
-from emberwatch.landscape.schedule import Clock, Time
+from emberwatch.landscape.schedule import SECONDS, SINCE_1970, Clock, Time
 
-#: Attributes that name auxiliary variables.
-_ABOUT: Final = ("bounds", "cell_measures", "climatology", "coordinates", "grid_mapping")
+#: Standard names, units and attributes `axis` of coordinates, or names of dimensions, by axis.
+_WORDS: Final = {
+    "X": set(
+        "x projection_x_coordinate longitude grid_longitude degrees_east degree_east degrees_e "
+        "lon rlon easting dimx west_east".split()
+    ),
+    "Y": set(
+        "y projection_y_coordinate latitude grid_latitude degrees_north degree_north degrees_n "
+        "lat rlat northing dimy south_north".split()
+    ),
+    "T": set("t time dimt date step layer band".split()),
+    "Z": {"z"},
+}
+#: Names of coordinates that are most likely angles, not metres.
+_ANGLES: Final = {"lat", "latitude", "rlat", "lon", "longitude", "rlon"}
+_DEGREES: Final = (math.radians(1.0), True)
 #: Attributes that are not supported, as they change the meaning of dimensions or times.
 _NOT_READ: Final = ("climatology", "compress", "coordinate_interpolation")
+_EVEN: Final = 0.1  # tolerance for positions, as a share of a cell, as 32-bit numbers are rounded
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
     """Yields a layer for each time of a variable. The file is closed after the last layer."""
-    netcdf4 = library("netCDF4", file)
-    # Latin-1 keeps all bytes of the path in any locale.
-    path = os.fsencode(file.absolute()).decode("latin-1")
-    try:
-        with netcdf4.Dataset(path, encoding="latin-1") as dataset:
-            variables: dict[str, Any] = {
-                f"{variable.group().path}/{variable.name}".lstrip("/"): variable
-                for variable in _variables(dataset)
-            }
-            name = choose_variable(file, list(variables), choice.variable)
-            yield from _layers(file, variables[name], choice)
-    except InvalidArgumentError:
-        raise
-    except Exception as error:  # netCDF4 and NumPy raise different errors for damaged bytes
-        words = getattr(error, "strerror", None) or error
-        raise InvalidArgumentError(f"{file}: expected a NetCDF file, got: {words}") from None
+    xarray, _ = library("xarray", file), library("netCDF4", file)
+    options = {"decode_times": False, "decode_coords": "all", "cache": False}
+    with warnings.catch_warnings(action="ignore"), TemporaryDirectory() as folder:
+        # xarray decodes paths by the locale; this one is plain.
+        link = Path(folder, "input.nc")
+        link.symlink_to(file.absolute())
+        try:
+            with closing(xarray.open_datatree(link, engine="netcdf4", **options)) as tree:
+                arrays = {
+                    f"{group.path}/{name}".lstrip("/"): array
+                    for group in tree.subtree
+                    for name, array in group.data_vars.items()
+                    if array.ndim > 1 and array.dtype.kind in "biufc"
+                }
+                name = choose_variable(file, list(arrays), choice.variable)
+                yield from _layers(file, arrays[name], choice)
+        except InvalidArgumentError:
+            raise
+        except Exception as error:  # netCDF4, xarray and NumPy raise different errors
+            words = getattr(error, "strerror", None) or error
+            raise InvalidArgumentError(f"{file}: expected a NetCDF file, got: {words}") from None
 
 
-def _variables(dataset: Any) -> list[Any]:
-    """Returns the numeric variables with rows and columns, without auxiliary variables."""
-    dataset.set_auto_maskandscale(False)
-    every = list(_all(dataset))
-    tables = [attributes(variable) for variable in every]
-    words = " ".join(str(given.get(key, "")) for given in tables for key in _ABOUT)
-    about = {word.rpartition("/")[2] for word in words.replace(": ", " ").split()}
-    return [
-        variable
-        for variable in every
-        if variable.ndim > 1
-        and getattr(variable.dtype, "kind", "") in "iufcV"
-        and variable.name not in about
-    ]
-
-
-def _all(group: Any) -> Iterator[Any]:
-    yield from group.variables.values()
-    for inner in group.groups.values():
-        yield from _all(inner)
-
-
-def _layers(file: Path, variable: Any, choice: Choice) -> Iterator[Layer]:
-    given, axes = attributes(variable), axes_of(file, variable)
-    _check_attributes(file, variable, *(axis.coordinate for axis in axes.values()))
-    rows, columns, time = axes["Y"].position, axes["X"].position, axes.get("T")
-    place, turned = _place(file, variable, axes)
-    times, time_clock = _times(file, variable, time)
-    n_layers = 1 if time is None else variable.shape[time.position]
-    for band in choose_bands(file, n_layers, choice):
-        name = f"{file}, band {band}" if n_layers > 1 else str(file)
-        if times is not None and not math.isfinite(times[band - 1]):
-            raise invalid(name, "a time", times[band - 1])
-        where: list[Any] = [slice(None)] * variable.ndim
-        if time is not None:
-            where[time.position] = band - 1
-        values = unpacked(name, variable[tuple(where)], given, choice.nodata)
+def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
+    for name, one in ((name, one) for one in (array, *array.coords.values()) for name in _NOT_READ):
+        given = one.encoding | one.attrs
+        if name in given:
+            raise invalid(f"{file}, {one.name}", f"no {name}", f"'{given[name]}'")
+    if array.dtype.kind == "c" or 0 in array.shape:
+        raise invalid(file, "real numbers", f"{array.dtype} {array.shape}")
+    axes = _axes(file, array)
+    place, turned = _place(file, array, axes["Y"], axes["X"])
+    times = _times(file, array, axes.get("T"))
+    array = array.transpose(*(axes[letter] for letter in "TYX" if letter in axes))
+    array = array if array.ndim == 3 else array.expand_dims("layer")
+    low, high = _limits(f"{file}, {array.name}", array)
+    for band in choose_bands(file, len(array), choice):
+        name = f"{file}, band {band}" if len(array) > 1 else str(file)
+        time = times[band - 1]._replace(name=name) if times else None
+        if time is not None and not math.isfinite(time.value):
+            raise invalid(name, "a time", time.value)
+        values, cut = window(name, array[band - 1][turned], place, choice)
+        values[(values < low) | (values > high)] = np.nan
         yield Layer(
             name=name,
-            values=(values if rows < columns else values.T)[turned].copy(),
-            place=place,
-            clock=_clock(given),
-            flags=_flags(given),
-            time=None if times is None else Time(float(times[band - 1]), time_clock),
+            values=values,
+            place=cut,
+            clock=_clock(array),
+            stored=array.encoding["dtype"],
+            time=time,
         )
 
 
-def _flags(given: Attributes) -> tuple[tuple[float, str], ...]:
-    numbers = np.atleast_1d(given.get("flag_values", given.get("flag_masks", ())))
-    return tuple(zip(numbers.tolist(), str(given.get("flag_meanings", "")).split(), strict=False))
-
-
-def _check_attributes(file: Path, *variables: Any) -> None:
-    for variable in variables:
-        for name in _NOT_READ:
-            if variable is not None and name in variable.ncattrs():
-                got = f"'{variable.getncattr(name)}'"
-                raise invalid(f"{file}, {variable.name}", f"no {name}", got)
-
-
-def _place(file: Path, variable: Any, axes: dict[str, Axis]) -> tuple[Place, tuple[slice, slice]]:
-    """Returns the grid of a variable, and slices that put the north-west cell first."""
-    shape = variable.shape[axes["Y"].position], variable.shape[axes["X"].position]
-    check_cells(file, *shape)
-    if 0 in variable.shape:
-        raise invalid(file, "cells", " x ".join(map(str, variable.shape)))
-    mapping = _mapping(variable, getattr(axes["X"].coordinate, "name", ""))
-    x, y = line(file, axes["X"], mapping), line(file, axes["Y"], mapping)
-    turned = (
-        slice(None, None, 1 if y is not None and y.is_falling else -1),
-        slice(None, None, -1 if x is not None and x.is_falling else 1),
+def _limits(name: str, array: Any) -> tuple[float, float]:
+    """Returns the smallest and largest valid number; packed ones have the type of the file."""
+    given, packing = array.attrs, array.encoding
+    limits = given.get("valid_min", -np.inf), given.get("valid_max", np.inf)
+    limits = given.get("valid_range", limits)
+    if np.size(limits) != 2:
+        raise invalid(f"{name}, valid_range", "two numbers", limits)
+    scale, offset = packing.get("scale_factor", 1.0), packing.get("add_offset", 0.0)
+    low, high = (
+        float(limit * scale + offset if np.asarray(limit).dtype == packing["dtype"] else limit)
+        for limit in limits
     )
+    slack = abs(scale) / 10 if array.dtype != packing["dtype"] else 0.0  # unpacked with rounding
+    return low - slack, high + slack
+
+
+def _axes(file: Path, array: Any) -> dict[str, str]:
+    """Returns the dimensions of columns (X), rows (Y) and, if there is one, time (T)."""
+    letters = list[str]()
+    for name in array.dims:
+        stated = [_stated(file, one) for one in _along(array, name)]
+        by_name = [letter for letter, words in _WORDS.items() if name.lower() in words]
+        letters.append(next(filter(None, [*stated, *by_name]), ""))
+    for letter in "XY":  # by default, the last dimensions are rows and columns
+        if letter not in letters and "" in letters:
+            letters[len(letters) - 1 - letters[::-1].index("")] = letter
+    if sorted(letters) not in (["X", "Y"], ["T", "X", "Y"]):
+        pairs = list(zip(letters, array.dims, strict=True))
+        wrong = [name for letter, name in pairs if letter in ("", "Z") or letters.count(letter) > 1]
+        got = f"one with {', '.join(wrong or array.dims)}"
+        raise invalid(file, "a variable with the dimensions time, rows and columns", got)
+    return dict(zip(letters, array.dims, strict=True))
+
+
+def _along(array: Any, dimension: str) -> list[Any]:
+    """Returns the coordinates along a dimension, that of the dimension's name first."""
+    along = [one for one in array.coords.values() if one.dims == (dimension,)]
+    return sorted(along, key=lambda one: one.name != dimension)
+
+
+def _stated(file: Path, one: Any) -> str:
+    """Returns the axis (X, Y, Z or T) that a coordinate's attributes state; empty if none."""
+    told = {str(one.attrs.get(key, "")).lower() for key in ("axis", "standard_name", "units")}
+    said = [letter for letter, words in _WORDS.items() if words & told]
+    if len(said) > 1:
+        raise invalid(f"{file}, {one.name}", "one axis", " and ".join(said))
+    is_time = _clock(one).unit() is not None or "%Y" in _clock(one).words
+    return said[0] if said else "T" if is_time else ""
+
+
+def _place(file: Path, array: Any, rows: str, columns: str) -> tuple[Place, tuple[slice, slice]]:
+    """Returns the grid of a variable, and slices that put the north-west cell first."""
+    shape = array.sizes[rows], array.sizes[columns]
+    x, y = (next(iter(_along(array, name)), None) for name in (columns, rows))
+    for one in array.coords.values() if x is None or y is None else ():
+        if {rows, columns} <= {*one.dims} and _stated(file, one) in ("X", "Y"):
+            got = f"{one.name} with {', '.join(one.dims)}; reproject it"
+            raise invalid(file, "coordinates with one dimension", got)
+    (west, width), (south, height) = (
+        (0.0, 1.0) if one is None else _line(file, one) for one in (x, y)
+    )
+    turned = slice(None, None, 1 if height < 0 else -1), slice(None, None, -1 if width < 0 else 1)
     if x is None or y is None:
-        _check_straight(file, variable, axes)
         return Place(shape=shape), turned
-    is_in_degrees, unit = x.unit == "degrees", x.unit or y.unit
-    if is_in_degrees != (y.unit == "degrees"):
-        raise invalid(file, "rows and columns in one unit", "degrees and metres")
-    projection = _projection(file, mapping, is_in_degrees=is_in_degrees)
-    share = _share(file, projection, unit)
-    width, height = x.cell or y.cell or 1.0, y.cell or x.cell or 1.0
-    west = (round(x.low + 180, 9) % 360) - 180 if is_in_degrees else x.low
+    units = [unit for unit in (_unit(file, array, one) for one in (x, y)) if unit]
+    length, is_angle = units[0] if units else (1.0, False)
+    projection = _projection(file, array, is_angle=is_angle)
+    known = (unit_of(projection) if projection else None) or (1.0, is_angle)
+    if any(unit[1] != known[1] for unit in units):
+        expected, got = ("degrees", "metres") if known[1] else ("metres", "degrees")
+        raise invalid(file, f"coordinates in {expected}, as its grid mapping or columns", got)
+    share = length / known[0] if units else 1.0
+    west = (round(west + 180, 9) % 360) - 180 if is_angle else west
+    width, height = abs(width) or abs(height) or 1.0, abs(height) or abs(width) or 1.0
     place = Place(
         shape=shape,
-        corner=(west * share, (y.low + shape[0] * height) * share),
+        corner=((west - width / 2) * share, (south + (shape[0] - 0.5) * height) * share),
         cell=(width * share, height * share),
         projection=projection,
-        metres=1.0 if unit == "m" else None,
+        metres=1.0 if units and not is_angle else None,
     )
     return place, turned
 
 
-def _check_straight(file: Path, variable: Any, axes: dict[str, Axis]) -> None:
-    """Refuses rows and columns with two-dimensional coordinates, which are curves on the ground."""
-    sides = {axes["X"].name, axes["Y"].name}
-    for found in auxiliary(variable):
-        if sides <= {*found.dimensions} and letter_of(file, found) in ("X", "Y"):
-            raise invalid(
-                file,
-                "coordinates with one dimension",
-                f"{found.name} with {', '.join(found.dimensions)}; reproject it",
-            )
+@np.errstate(over="ignore", invalid="ignore")
+def _line(file: Path, one: Any) -> tuple[float, float]:
+    """Returns the smallest coordinate, and the distance between two, below 0 if they decrease."""
+    at: NDArray[np.float64] = one.values.astype(np.float64)
+    if str(one.attrs.get("units", "")).lower() in _WORDS["X"]:  # degrees east
+        at = np.unwrap(at, period=360)
+    step = float(at[-1] - at[0]) / max(1, at.size - 1)
+    errors = at - at[0] - step * np.arange(at.size)
+    if (at.size > 1 and step == 0) or not np.abs(errors).max() <= _EVEN * abs(step):
+        sizes = np.abs(np.diff(at))
+        got = f"some of {sizes.min():.6g} and some of {sizes.max():.6g}" if sizes.size else at[0]
+        raise invalid(f"{file}, {one.name}", "cells of one size side by side", got)
+    return float(min(at[0], at[-1])), step
 
 
-def _mapping(variable: Any, column: str) -> Attributes:
-    """Returns the attributes of the grid mapping; if there are several, of the columns' mapping."""
-    words = str(attributes(variable).get("grid_mapping", "")).split()
-    name = named = ""
-    for word in words:
-        if word.endswith(":"):
-            named = word[:-1]
-        elif word == column or len(words) == 1:
-            name = named or word
-    found = find(variable.group(), name) if name else None
-    return {} if found is None else attributes(found)
+def _unit(file: Path, array: Any, one: Any) -> tuple[float, bool] | None:
+    """Returns a unit's length in metres or radians, and whether it is an angle."""
+    unit, name = (str(one.attrs.get(key, "")).strip().lower() for key in ("units", "standard_name"))
+    if unit.startswith("degree") or (not unit and "itude" in name):
+        return _DEGREES
+    if unit in ("rad", "radian", "radians"):  # of a geostationary satellite
+        mapping = array.coords.get(array.encoding.get("grid_mapping"))
+        return float(mapping.attrs["perspective_point_height"]), False
+    if unit in ("", "1") and one.name.lower() not in _ANGLES:
+        return None
+    known = unit_named(unit)
+    if known is None:
+        raise invalid(f"{file}, {one.name}, units", "degrees, m, km or feet", f"'{unit}'")
+    return METRES[known], False
 
 
-def _projection(file: Path, mapping: Attributes, *, is_in_degrees: bool) -> str | None:
-    """Returns the projection as well-known text.
-
-    A grid mapping that pyproj does not know becomes a list of its attributes, for comparisons only.
-    """
-    pyproj = library("pyproj", file)
-    text = mapping.get("crs_wkt") or mapping.get("spatial_ref")
-    if text:
-        return str(text)
-    if not mapping:
-        return pyproj.CRS("EPSG:4326").to_wkt() if is_in_degrees else None
-    name = mapping.get("grid_mapping_name", "grid mapping")
+def _projection(file: Path, array: Any, *, is_angle: bool) -> str | None:
+    """Returns the projection as well-known text; degrees without one refer to WGS 84."""
+    name = array.encoding.get("grid_mapping", "")
+    if ":" in name:
+        raise invalid(file, "one grid mapping", f"'{name}'")
+    if name not in array.coords:
+        return library("pyproj", file).CRS("EPSG:4326").to_wkt() if is_angle else None
     try:
-        return pyproj.CRS.from_cf({"projected_crs_name": name} | dict(mapping)).to_wkt()
-    except Exception:  # pyproj may raise any error for unexpected attributes
-        words = ", ".join(f"{key} {value}" for key, value in sorted(mapping.items()))
-        return f'"{name}" {words}'
+        return library("pyproj", file).CRS.from_cf(array.coords[name].attrs).to_wkt()
+    except Exception as error:  # pyproj may raise any error for unexpected attributes
+        raise invalid(f"{file}, {name}", "a grid mapping of CF", error) from None
 
 
-def _share(file: Path, projection: str | None, unit: str) -> float:
-    """Returns the factor that converts metres or degrees to the unit of the projection."""
-    known = None if projection is None else unit_of(projection)
-    if known is None or not unit:
-        return 1.0
-    length, is_angle = known
-    if is_angle != (unit == "degrees"):
-        words = ("metres", "degrees") if is_angle else ("degrees", "metres")
-        raise invalid(file, f"coordinates in {words[1]}, the unit of its grid mapping", words[0])
-    return (math.radians(1.0) if is_angle else 1.0) / length
+def _times(file: Path, array: Any, dimension: str | None) -> list[Time]:
+    """Returns the times of the layers, along a dimension or of one layer; empty if there are none.
 
-
-def _times(
-    file: Path, variable: Any, time: Axis | None
-) -> tuple[NDArray[np.float64] | None, Clock]:
-    """Returns the times of the layers and their clock, from a dimension or a scalar coordinate.
-
-    The times are None if the file has none.
+    A scalar may also be another time, such as a reference time. Numbers such as 20200831.5 become
+    seconds.
     """
-    if time is not None:
-        found = time.coordinate
-    else:
-        scalars = [found for found in auxiliary(variable) if not found.dimensions]
-        found = next((found for found in scalars if _is_time(file, found)), None)
-    if found is None:
-        return None, Clock()
-    given = attributes(found)
-    return unpacked(f"{file}, {found.name}", np.atleast_1d(found[...]), given), _clock(given)
+    found = _along(array, dimension) if dimension else []
+    for one in array.coords.values() if dimension is None else ():
+        is_time = one.ndim == 0 and one.attrs.get("standard_name", "time") == "time"
+        found += [one] if is_time and _stated(file, one) == "T" else []
+    if not found:
+        return []
+    time = found[0]
+    numbers, clock = np.atleast_1d(time.values).astype(np.float64), _clock(time)
+    kind = np.dtype(time.encoding["dtype"])
+    gap = float(np.spacing(np.nanmax(np.abs(numbers)).astype(kind))) if kind.kind == "f" else 0.0
+    if re.fullmatch(r"days? as %Y%m%d(\.%f)?", clock.words):
+        numbers, gap = _seconds(f"{file}, {time.name}", numbers), gap * SECONDS["d"]
+        clock = Clock(SINCE_1970)
+    return [Time(str(file), number, clock, gap) for number in numbers.tolist()]
 
 
-def _is_time(file: Path, scalar: Any) -> bool:
-    """Returns whether a scalar is the time of the layer, not, for example, a reference time."""
-    standard_name = attributes(scalar).get("standard_name", "time")
-    return standard_name == "time" and letter_of(file, scalar) == "T"
+def _seconds(name: str, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    try:
+        days = [datetime.strptime(f"{int(n)}", "%Y%m%d").replace(tzinfo=UTC) for n in numbers]
+    except ValueError as error:
+        raise invalid(name, "days as %Y%m%d.%f", error) from None
+    return np.array([day.timestamp() for day in days]) + numbers % 1 * SECONDS["d"]
 
 
-def _clock(given: Attributes) -> Clock:
-    return Clock(str(given.get("units", "")), str(given.get("calendar", "standard")))
+def _clock(one: Any) -> Clock:
+    calendar = str(one.attrs.get("calendar", "standard")).lower()
+    is_standard = calendar in ("gregorian", "proleptic_gregorian")  # they agree since 1583
+    return Clock(str(one.attrs.get("units", "")), "standard" if is_standard else calendar)

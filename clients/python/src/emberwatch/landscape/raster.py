@@ -1,8 +1,10 @@
-"""Reader of GeoTIFF and ESRI ASCII grids, which uses GDAL through rasterio."""
+"""Reader of GeoTIFF and ESRI ASCII grids, which uses GDAL through rioxarray."""
 
-import contextlib
+import re
 import warnings
 from collections.abc import Generator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,107 +14,118 @@ from numpy.typing import NDArray
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import LIKE, Place
-from emberwatch.landscape.layers import Choice, Layer, check_cells, choose_bands, is_missing
+from emberwatch.landscape.layers import Choice, Layer, choose_bands, window
 from emberwatch.landscape.libraries import library
 from emberwatch.landscape.schedule import Clock
 
-#: First words of the header lines of an ESRI ASCII grid.
-_ASCII_HEADER: Final = frozenset(
-    "ncols nrows xllcorner yllcorner xllcenter yllcenter cellsize dx dy nodata_value".split()
+#: Descriptions of bands that say which cells of other bands are valid.
+_AUXILIARY: Final = re.compile(r"(?i)\b(alpha|(data|valid\w*|cloud) ?mask|quality|q[ac])\b")
+
+#: A header line of an ESRI ASCII grid.
+_HEADER: Final = re.compile(
+    rb"(?i)\s*(ncols|nrows|[xy]ll(corner|center)|cellsize|d[xy]|nodata_value)\s"
 )
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
     """Yields the bands of a file, which is closed after the last one."""
-    if choice.variable is not None:
-        raise InvalidArgumentError(
-            f"--variable: {file} has no variables, got '{choice.variable}'; leave the flag out"
-        )
     is_ascii = file.suffix.lower() == ".asc"
     driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
-    rasterio, errors = library("rasterio", file), library("rasterio.errors", file)
+    rasterio, rioxarray = library("rasterio", file), library("rioxarray", file)
+    path = Path(utf8("file", file.absolute()))
     # GDAL warns about files without a position, which are valid; its other warnings do not help
     # users.
     with warnings.catch_warnings(action="ignore"):
         try:
-            with rasterio.open(Path(utf8("file", file.absolute())), driver=driver) as source:
-                place = _place(file, source)
-                for band in choose_bands(file, source.count, choice):
-                    if is_ascii:
-                        values = _ascii(file, place.shape, choice.nodata)
-                    else:
-                        values = _values(file, source, band, choice.nodata)
-                    yield Layer(
-                        name=f"{file}, band {band}" if source.count > 1 else str(file),
-                        values=values,
-                        place=place,
-                        clock=Clock(source.units[band - 1] or ""),
+            with rasterio.open(path, driver=driver) as source, ExitStack() as stack:
+                place, (bands, alpha) = _place(file, source), _bands(file, source, choice)
+                if is_ascii:
+                    arrays = [_ascii(file, source)]
+                else:
+                    arrays = stack.enter_context(
+                        rioxarray.open_rasterio(
+                            path, mask_and_scale=True, decode_times=False, cache=False
+                        )
                     )
-        except errors.RasterioError as error:
+                for band in bands:
+                    name = f"{file}, band {band}" if source.count > 1 else str(file)
+                    array = _turned(arrays[band - 1], source.transform)
+                    values, cut = window(name, array, place, choice)
+                    if alpha:
+                        array = _turned(arrays[alpha - 1], source.transform)
+                        is_valid = window(name, array, place, replace(choice, nodata=()))[0] > 0
+                        values[~is_valid] = np.nan
+                    yield Layer(
+                        name=name,
+                        values=values,
+                        place=cut,
+                        clock=Clock(source.units[band - 1] or ""),
+                        stored=np.dtype("f8" if is_ascii else source.dtypes[band - 1]),
+                    )
+        except InvalidArgumentError:
+            raise
+        except Exception as error:  # rasterio and rioxarray have no common base class
             words = error.__cause__ or error
             raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
 
 
+def _bands(file: Path, source: Any, choice: Choice) -> tuple[Sequence[int], int]:
+    """Returns the bands with values, and the alpha band, which is 0 in cells without; 0: none."""
+    if source.subdatasets:
+        pages = f"{len(source.subdatasets)} pages; make bands of them (gdal_merge.py -separate)"
+        raise invalid(file, "one image", pages)
+    bands = choose_bands(file, source.count, choice)
+    if any(source.dtypes[band - 1].startswith("complex") for band in bands):
+        raise invalid(file, "real numbers", source.dtypes[bands[0] - 1])
+    kinds, labels = source.colorinterp, source.descriptions
+    alpha = [band for band in source.indexes if kinds[band - 1].name == "alpha"]
+    odd = alpha + [band for band in bands if _AUXILIARY.search(labels[band - 1] or "")]
+    if choice.band is None and odd and not (odd == alpha and len(bands) == 2):
+        remedy = f"choose with --band; if it is one, gdal_edit.py -colorinterp_{odd[0]} gray"
+        got = f"band {odd[0]}, '{labels[odd[0] - 1] or 'alpha'}'; {remedy}"
+        raise invalid(file, "bands of layers", got)
+    others = [band for band in bands if band not in alpha]
+    return (others, min(alpha, default=0)) if others else (bands, 0)
+
+
 def _place(file: Path, source: Any) -> Place:
     """Returns the grid of a file. If the transform is the identity, the file has no position."""
-    check_cells(file, source.height, source.width)
     (height, width), transform, crs = source.shape, source.transform, source.crs
+    # Measured over the whole grid, because rotations by tiny angles are rounding errors.
+    skewed = abs(transform.b) * height > LIKE * abs(transform.a)
+    if skewed or abs(transform.d) * width > LIKE * abs(transform.e) or source.gcps[0]:
+        got = "a rotated grid; reproject it (gdalwarp -t_srs)"
+        raise invalid(file, "rows from west to east", got)
     if transform.is_identity:
         return Place(shape=source.shape)
-    # The skew is measured over the whole grid, because rotations by tiny angles are rounding
-    # errors.
-    skewed = abs(transform.b) * height, abs(transform.d) * width
-    if skewed[0] > LIKE * abs(transform.a) or skewed[1] > LIKE * abs(transform.e):
-        raise invalid(
-            file, "rows from west to east", "a rotated grid; reproject it (gdalwarp -t_srs)"
-        )
-    far = transform * (width, height)
+    east, south = transform.c + transform.a * width, transform.f + transform.e * height
     return Place(
         shape=source.shape,
-        corner=(min(transform.c, far[0]), max(transform.f, far[1])),
+        corner=(min(transform.c, east), max(transform.f, south)),
         cell=(abs(transform.a), abs(transform.e)),
         projection=crs.to_wkt() if crs else None,
     )
 
 
-def _values(file: Path, source: Any, band: int, nodata: Sequence[float]) -> NDArray[np.float64]:
-    dtype = source.dtypes[band - 1]
-    if dtype.startswith("complex"):
-        raise invalid(file, "real numbers", dtype)
-    stored: Any = source.read(band, masked=True)
-    values = stored.data.astype(np.float64) * source.scales[band - 1] + source.offsets[band - 1]
-    values[stored.mask | is_missing(stored.data, nodata)] = np.nan
-    southward, eastward = source.transform.e < 0, source.transform.a > 0
-    if source.transform.is_identity:  # no position: the rows stay in their order
-        return values
-    return values[:: 1 if southward else -1, :: 1 if eastward else -1].copy()
+def _turned(array: Any, transform: Any) -> Any:
+    """Returns a band whose first row is in the north, and first column in the west."""
+    if transform.is_identity:  # no position: the rows stay in their order
+        return array
+    return array[:: 1 if transform.e < 0 else -1, :: 1 if transform.a > 0 else -1]
 
 
-def _ascii(file: Path, shape: tuple[int, int], nodata: Sequence[float]) -> NDArray[np.float64]:
+def _ascii(file: Path, source: Any) -> NDArray[np.float64]:
     """Parses an ASCII grid. GDAL would accept too few or too many numbers, and read words as 0."""
-    rows, never = list[NDArray[np.float64]](), ""
-    with file.open(encoding="ascii", errors="replace") as lines:
-        for line in lines:
-            words = line.lower().replace(",", ".").split()
-            if words and words[0] in _ASCII_HEADER and not rows:
-                never = words[-1] if words[0] == "nodata_value" else never
-            elif words:
-                rows.append(np.array([_number(file, word, never) for word in words]))
-    values = np.concatenate(rows) if rows else np.empty(0)
-    if values.size != shape[0] * shape[1]:
-        wanted = f"{shape[0] * shape[1]} numbers for {shape[0]} x {shape[1]} cells"
-        raise invalid(file, wanted, values.size)
-    with contextlib.suppress(ValueError):
-        nodata = (*nodata, float(never))
-    with np.errstate(over="ignore"):  # compared as 32-bit numbers: the header may be rounded
-        values[is_missing(values.astype(np.float32), nodata)] = np.nan
-    return values.reshape(shape)
-
-
-def _number(file: Path, word: str, never: str) -> float:
-    try:
-        return np.nan if word == never else float(word)
-    except ValueError:
-        raise invalid(
-            file, "numbers", f"'{word[:40]}'; NODATA_value can define a word for no value"
-        ) from None
+    with file.open("rb") as opened:
+        start = 0
+        while _HEADER.match(opened.readline()):
+            start = opened.tell()
+        opened.seek(start)
+        values = np.concatenate([np.array(line.split(), np.float64) for line in opened])
+    if values.size != source.height * source.width:
+        expected = f"{source.height * source.width} numbers for {source.height} x {source.width}"
+        raise invalid(file, f"{expected} cells", values.size)
+    if source.nodata is not None:  # compared as 32-bit numbers: the header may be rounded
+        with np.errstate(over="ignore"):
+            values[values.astype(np.float32) == np.float32(source.nodata)] = np.nan
+    return values.reshape(source.shape)

@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from datetime import datetime
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
@@ -36,12 +35,12 @@ COLORS: Final[tuple[Color, ...]] = tuple(color_from_hex(state.color) for state i
 _RIGHT, _WRONG = 0.98, 0.01
 
 
-def description(name: str, step: str, begins: Sequence[datetime | None] = ()) -> str:
+def description(name: str, step: str, begins: Sequence[str | None] = ()) -> str:
     """Returns the text of the `.toml`; `begins`: dates of step 0 of the sequences, if known."""
     lines = [f"name = {quoted(name)}", f"step = {quoted(step)} # duration of a step"]
     for array, begin in zip(_arrays(len(begins)), begins, strict=True):
         if begin is not None:
-            lines.append(f"# {array} begins at {begin:%Y-%m-%d %H:%M:%S} UTC")
+            lines.append(f"# {array} begins at {begin}")
     for state in STATES:
         row = ", ".join(str(_RIGHT if other is state else _WRONG) for other in STATES)
         lines += ["", "[[states]]", f'name = "{state.name}"', f'color = "{state.color}"']
