@@ -97,7 +97,7 @@ impl Sightings {
     }
 
     /// Returns whether the sightings fit a grid and a number of observations.
-    pub fn are_of(&self, shape: Shape, n_observations: usize) -> bool {
+    fn are_of(&self, shape: Shape, n_observations: usize) -> bool {
         let fits = |seen: &Sighting| {
             let is_value = usize::from(seen.value) < n_observations || seen.value == UNOBSERVED;
             is_value && seen.step <= self.step

@@ -29,7 +29,7 @@ pub struct TrainingSpec {
     pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
-    /// Seed with which the first world begins, followed by those of the others; `None`: running episodes continue.
+    /// Seed of the first world; world i begins with this seed plus i. `None`: running episodes continue.
     pub first_seed: Option<u64>,
     pub device: Device,
     pub config: AgentConfig,
@@ -38,7 +38,7 @@ pub struct TrainingSpec {
 }
 
 impl TrainingSpec {
-    /// Checks the folder and the number of worlds, before a server is started or its robots are acquired. Returns the
+    /// Checks the folder and the number of worlds, before worlds are simulated or robots acquired. Returns the
     /// contents of the checkpoint to resume.
     pub fn check(&self) -> Result<Option<Contents>> {
         let place = self.out.join(CHECKPOINT);

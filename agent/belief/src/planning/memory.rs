@@ -100,7 +100,7 @@ impl Memory {
     }
 
     /// Returns whether the memory fits a grid and all its values are valid.
-    pub fn is_of(&self, shape: Shape) -> bool {
+    fn is_of(&self, shape: Shape) -> bool {
         let rewards = [self.recent.last_reward, self.recent.mean_reward];
         self.freshness.dim() == shape.dim()
             && self

@@ -22,7 +22,7 @@ fn airspace(key: u64, shape: Shape, start: Cell, radius: usize) -> Airspace {
     Airspace::new(shape, Some(Arc::new(map)), radius)
 }
 
-/// Computes the score of the robots' paths from the set of their cells, each of which counts once.
+/// Computes the score of the robots' paths from the set of their cells. Each cell counts once.
 fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]]) -> f32 {
     let shape = air.shape();
     let value = |at: (usize, usize)| match objective.target {

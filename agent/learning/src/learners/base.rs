@@ -37,7 +37,7 @@ pub struct LearnerKind {
     pub needs_base: bool,
     /// Returns the default number of world steps of a training run. 0 means that it runs until stopped.
     pub steps: fn(&AgentConfig) -> u64,
-    /// Returns the number of steps per episode on a server that `train` starts. `None` means endless episodes.
+    /// Returns the number of steps per episode in worlds that `train` simulates. `None` means endless episodes.
     pub episode_steps: fn(&AgentConfig) -> Option<u64>,
     /// Returns the number of world steps that the learner of a checkpoint has learned from.
     pub done: fn(&Contents) -> Result<u64>,

@@ -52,7 +52,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
 
 
 def _numbers(file: Path, table: Any, name: str) -> Any:
-    """Returns a column of numbers; without `scan` or `track`, that of pixels at nadir."""
+    """Returns a column of numbers. Without `scan` or `track`, pixels have their size at nadir."""
     words = table[name] if name in table else table.get("instrument")
     if words is None:
         raise invalid(file, "the columns scan and track, or instrument", "none of them")

@@ -264,7 +264,7 @@ def _marked(
 
 
 def _check_order(layer: Layer, before: NDArray[np.uint8], now: NDArray[np.uint8]) -> None:
-    """Refuses states that cannot follow those of the previous layer."""
+    """Refuses a cell whose state cannot follow its state in the previous layer."""
     for state, words in (
         (BURNING, "burnt cells to stay burnt, got {} that burn again"),
         (UNBURNT, "burning cells not to become unburnt, got {} that are unburnt again"),

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:
-    """Adds the flags that choose what is read from each file, and those of the output."""
+    """Adds the flags for reading each file and for the output."""
     add = parser.add_argument
     add("--variable", metavar="NAME", help="the variable or layer, if a file has several")
     add("--band", type=whole, metavar="N", help="the only band to read from each file [all]")

@@ -132,7 +132,7 @@ def _axes(file: Path, array: Any) -> dict[str, str]:
 
 
 def _along(array: Any, dimension: str) -> list[Any]:
-    """Returns the coordinates along a dimension, that of the dimension's name first."""
+    """Returns the coordinates along a dimension, starting with the one of its name."""
     along = [one for one in array.coords.values() if one.dims == (dimension,)]
     return sorted(along, key=lambda one: one.name != dimension)
 
