@@ -303,9 +303,14 @@ fn first_observations(
     spec: &TrainingSpec,
 ) -> Result<Vec<Observation>, ConnectionError> {
     if let Some(first) = spec.first_seed {
-        let seeds = (first..).map(Some);
-        let worlds = spec.worlds.clone().zip(seeds);
-        let worlds = worlds.map(|(world, seed)| WorldSeed { world, seed });
+        let worlds = spec
+            .worlds
+            .clone()
+            .zip(0..)
+            .map(|(world, index)| WorldSeed {
+                world,
+                seed: Some(first.wrapping_add(index)),
+            });
         client.reset(&worlds.collect::<Vec<_>>())?;
     }
     let mut observations = client.observe(client.robots())?;
