@@ -5,7 +5,7 @@
 //! each step. Run it with `cargo run --release -p tests --example own_belief`.
 
 use anyhow::Result;
-use emberwatch_acting::beliefs::{BeliefKind, Conditions, Input};
+use emberwatch_acting::beliefs::{BeliefKind, Conditions, Input, Traits};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
 use emberwatch_acting::policy::{BEAM, Goal, Policy};
@@ -44,7 +44,7 @@ const LAST_SEEN: BeliefKind = BeliefKind {
     is_parallel: false,
     learned_by: None,
     chart: ("last seen", [0x88, 0x22, 0x55]),
-    handover: None,
+    traits: Traits::NONE,
     build: |conditions| {
         let first = conditions.prior()?;
         Ok(Box::new(LastSeen {

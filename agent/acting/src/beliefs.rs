@@ -13,7 +13,9 @@ mod truth;
 mod world_form;
 
 pub use self::autoencoder::AUTOENCODER;
-pub use self::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy, numbered_states};
+pub use self::kind::{
+    BeliefKind, Conditions, Input, LearnedBelief, LearnedBy, Traits, cast, numbered_states,
+};
 pub use self::known::{KNOWN, KNOWN_CAVITIES, KNOWN_SPATIAL, KNOWN_SPATIAL_CAVITIES};
 pub use self::learned::{LEARNED, LEARNED_SPATIAL};
 pub use self::neural::{NEURAL, NEURAL_SENSOR};
@@ -113,7 +115,7 @@ mod tests {
                 for _ in 0..2 {
                     let bytes = both
                         .each_ref()
-                        .map(|one| one.handover().map(|it| it.to_bytes()));
+                        .map(|one| kind.traits.handover.map(|it| it(&**one).to_bytes()));
                     assert_eq!(bytes[0], bytes[1], "{kind:?}");
                     let beliefs = both.each_ref().map(|one| one.belief().to_bytes());
                     assert_eq!(beliefs[0], beliefs[1], "{kind:?}");

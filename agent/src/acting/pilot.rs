@@ -11,7 +11,7 @@ use anyhow::{Result, ensure};
 use emberwatch_acting::beliefs::first_belief::first_belief;
 use emberwatch_acting::beliefs::{Conditions, Input, WorldForm};
 use emberwatch_acting::policy::Policy;
-use emberwatch_acting::rollout::agent::{Agent, handover_of};
+use emberwatch_acting::rollout::agent::Agent;
 use emberwatch_acting::rollout::{self, Actor, Rollout, Seen, StepRecord, building};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::belief::Belief;
@@ -68,14 +68,12 @@ impl Pilot {
         check(mission, &info, (&model, &policy), is_recorded)?;
         // Simulating the prior can take long, so it happens before the lease begins. The simulation is skipped if a
         // former agent left a belief.
-        if let Some(of_belief) = policy.belief.handover
-            && is_belief_left(
-                &mission.instance,
-                numbers.start,
-                &handover_of(&of_belief(&model)),
-            )?
-            && let Some(attached) =
-                Self::continue_left(mission, &info, &numbers, (&model, &policy))?
+        let any = Belief::from_initial(&model, info.shape()?);
+        if policy.belief.knows_model
+            && let Some(kind) =
+                agent(mission, &info, (&model, &policy, &any), (0, 0))?.handover_kind()
+            && is_belief_left(&mission.instance, numbers.start, &kind)?
+            && let Some(attached) = Self::continue_left(mission, &numbers, (&model, &policy, &any))?
         {
             return Ok(attached);
         }
@@ -89,16 +87,14 @@ impl Pilot {
         Ok(attached)
     }
 
-    /// Acquires the robots and takes over the belief left for the first robot. Returns `None` if the belief is
-    /// outdated.
+    /// Acquires the robots and takes over the belief left for the first robot; the agent is built with any prior.
+    /// Returns `None` if the belief is outdated.
     fn continue_left(
         mission: &Mission,
-        info: &ServerInfo,
         numbers: &Range<u32>,
-        (model, policy): (&Model, &Policy),
+        parts: (&Model, &Policy, &Belief),
     ) -> Result<Option<Self>> {
-        let any = Belief::from_initial(model, info.shape()?);
-        let mut attached = Self::acquire(mission, numbers, (model, policy, &any))?;
+        let mut attached = Self::acquire(mission, numbers, parts)?;
         let (client, rollout) = (&mut attached.link.client, &mut attached.flyer.rollout);
         if take_over_left(client, numbers.start, rollout)? {
             return Ok(Some(attached));
@@ -134,7 +130,12 @@ impl Pilot {
             policy = policy.name,
             "acting"
         );
-        let agent = agent(mission, &link.client, parts, (seed, robots.start % team))?;
+        let agent = agent(
+            mission,
+            link.client.info(),
+            parts,
+            (seed, robots.start % team),
+        )?;
         let flyer = Flyer {
             feed: Feed::open(&mission.instance, agent.belief().probabilities()),
             rollout: Rollout::new(agent, seen),
@@ -177,7 +178,7 @@ impl Pilot {
         );
         let first = self.flyer.robots.start % self.flyer.team;
         let parts = (&self.model, &self.policy, &prior);
-        let agent = agent(mission, &self.link.client, parts, (seed, first))?;
+        let agent = agent(mission, self.link.client.info(), parts, (seed, first))?;
         self.flyer.rollout = Rollout::new(agent, seen);
         self.prior = Some(prior);
         self.begin()
@@ -331,17 +332,17 @@ fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -
 /// Creates an agent before its first frame. `seed` is the world's seed, and `first` is the agent's first robot there.
 fn agent(
     mission: &Mission,
-    client: &Client,
+    info: &ServerInfo,
     (model, policy, prior): (&Model, &Policy, &Belief),
     (seed, first): (u64, u32),
 ) -> Result<Agent> {
     let config = &mission.config;
     let conditions = Conditions {
         model: Some(model),
-        shape: client.shape(),
+        shape: info.shape()?,
         prior: Some(prior),
         learned: &mission.learned,
     };
     let seed = robot_seed(config.planner_seed(seed), first as usize);
-    building::agent(policy, config, &conditions, client.info().n_moves, seed)
+    building::agent(policy, config, &conditions, info.n_moves, seed)
 }

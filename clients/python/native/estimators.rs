@@ -237,7 +237,7 @@ impl Estimators {
         let worlds: Vec<&mut dyn Estimator> = worlds.collect();
         let n_numbers = worlds.len() * self.n_numbers();
         detached(py, n_numbers, || {
-            threads.work(is_short, |threads| predict_all(worlds, threads));
+            threads.work(is_short, |threads| self.predict_all(worlds, threads));
         });
         Ok(())
     }
@@ -285,9 +285,15 @@ impl Estimators {
         let frames = self.frames(py, frames.as_array(), &all)?;
         let State { worlds, threads } = &mut *state;
         let scored = worlds.iter_mut().zip(frames.iter().flatten());
+        let kind = self.origin.kind;
         let scored = threads.work(self.origin.is_short(1), |_| {
             let scores = scored.filter_map(|(world, frame)| {
-                Some(score(world.belief(), &*world.likelihood()?, frame))
+                let observation_model = kind.traits.observation_model?(&**world);
+                Some(score(
+                    world.belief(),
+                    &*observation_model.likelihood()?,
+                    frame,
+                ))
             });
             scores
                 .map(|score| (score.log_likelihood, score.n_seen as f64))
@@ -311,7 +317,8 @@ impl Estimators {
         let of_model = origin.model.as_ref().map(Model::n_observations);
         let first = worlds.first_mut();
         let of_belief = threads.work(origin.is_short(1), |_| {
-            first.and_then(|world| Some(world.likelihood()?.ncols()))
+            let observation_model = kind.traits.observation_model?(&**first?);
+            Some(observation_model.likelihood()?.ncols())
         });
         Ok(Self {
             kind: kind.name,
@@ -323,6 +330,16 @@ impl Estimators {
             state: Mutex::new(State { worlds, threads }),
             origin,
         })
+    }
+
+    /// Predicts the beliefs about some worlds, in one batch if the kind of belief supports it.
+    fn predict_all(&self, mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
+        match self.origin.kind.traits.predict_together {
+            Some(together) => together(worlds),
+            None => {
+                threads.each(worlds.iter_mut(), |world| world.predict());
+            }
+        }
     }
 
     /// Returns the number of probabilities in the belief about one world.
@@ -387,16 +404,6 @@ fn named(worlds: &[usize]) -> String {
         n => format!(" and {n} more"),
     };
     format!("world{plural} {}{more}", numbers.join(", "))
-}
-
-/// Predicts the beliefs about all worlds, in one batch if the kind of estimator supports it.
-fn predict_all(mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
-    match worlds.first().and_then(|first| first.predict_together()) {
-        Some(together) => together(worlds),
-        None => {
-            threads.each(worlds.iter_mut(), |world| world.predict());
-        }
-    }
 }
 
 /// Creates the exception for a belief that could not be built, or could not be corrected with a frame.

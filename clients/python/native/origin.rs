@@ -71,8 +71,8 @@ impl Origin {
             let what = format_args!("the beliefs about {n_worlds} worlds");
             check_memory(py, what, n_worlds.saturating_mul(of_world))
         };
-        // Every kind needs memory for at least a belief and a predictor. The first estimator, once built, reports how
-        // much it needs in total.
+        // Every kind needs memory for at least a belief and a predictor. How much more is estimated from the state that
+        // the first estimator would save.
         memory(2 * n_states * self.shape.n_cells() * size_of::<f32>())?;
         let first = py.detach(|| threads.work(self.is_short(1), |_| self.estimator()));
         let first = first.map_err(|error| unfit(py, &error))?;
@@ -81,7 +81,12 @@ impl Origin {
             let expected = format!("a belief on {expected}");
             return Err(invalid(py, "checkpoint", expected, got));
         }
-        memory(first.memory_bytes())?;
+        let saved = self
+            .kind
+            .traits
+            .handover
+            .map_or(0, |it| it(&*first).to_bytes().len());
+        memory(8 * size_of_val(first.belief().as_slice()) + 2 * saved)?;
         let others = py.detach(|| {
             threads.work(self.is_short(n_worlds), |threads| {
                 threads.each(1..n_worlds, |_| self.estimator())

@@ -141,12 +141,6 @@ impl Transition {
             }
         }
     }
-
-    /// Returns the approximate memory in bytes: the belief with margins, and the buffers.
-    pub fn memory_bytes(&self) -> usize {
-        let n_lanes = self.sums.len() + self.weights.len();
-        size_of_val(&*self.planes) + n_lanes * size_of::<Lanes>()
-    }
 }
 
 /// Returns the [`LANES`] values that begin at a place.

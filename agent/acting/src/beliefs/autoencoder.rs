@@ -2,14 +2,13 @@
 //! (eq. 10).
 
 use super::follower::Follower;
-
-use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
+use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy, Traits, cast};
 use super::learned::LEARNED;
 use super::world_form::WorldForm;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::correct;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
+use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, ObservationModel};
 use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::Frame;
 use emberwatch_network::{Autoencoder, Dqn, NetworkError};
@@ -29,7 +28,10 @@ pub const AUTOENCODER: BeliefKind = BeliefKind {
         find: |learned| learned.get::<AutoencoderModel>().map(|model| model as _),
     }),
     chart: LEARNED.chart,
-    handover: None,
+    traits: Traits {
+        observation_model: Some(|it| cast::<AutoencoderEstimator>(it)),
+        ..Traits::NONE
+    },
     build: |conditions| {
         let model = conditions.learned.get::<AutoencoderModel>();
         let model = model.context("checkpoint: expected a learned autoencoder, got none")?;
@@ -100,6 +102,11 @@ impl AutoencoderEstimator {
             follower,
         })
     }
+
+    /// Returns the hidden vector `h_k` from which the belief is computed, the input of the DQN (paper section III.E).
+    pub fn hidden(&self) -> &[f32] {
+        &self.follower.hidden
+    }
 }
 
 impl Estimator for AutoencoderEstimator {
@@ -120,13 +127,11 @@ impl Estimator for AutoencoderEstimator {
     fn belief(&self) -> &Belief {
         &self.belief
     }
+}
 
+impl ObservationModel for AutoencoderEstimator {
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         likelihood(&self.network).ok().map(Cow::Owned)
-    }
-
-    fn hidden(&self) -> Option<&[f32]> {
-        Some(&self.follower.hidden)
     }
 }
 

@@ -3,9 +3,10 @@
 use super::world_form::WorldForm;
 use crate::learned::Learned;
 use anyhow::{Context, Result};
-use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::{Estimator, Filter, Handover, ObservationModel, Told};
 use emberwatch_model::{Model, Shape};
+use std::any::Any;
 use std::fmt;
 
 /// A kind of belief: its constructor, names and properties.
@@ -25,11 +26,60 @@ pub struct BeliefKind {
     pub learned_by: Option<LearnedBy>,
     /// Legend text and colour (red, green, blue) of its policies in charts.
     pub chart: (&'static str, [u8; 3]),
-    /// Returns the name of the format in which an agent hands this belief over to a robot's next agent. Set only for
-    /// kinds that know the model.
-    pub handover: Option<fn(&Model) -> String>,
+    /// The optional traits of its estimators.
+    pub traits: Traits,
     /// Builds an estimator before its first frame.
     pub build: fn(&Conditions<'_>) -> Result<Box<dyn Estimator>>,
+}
+
+/// The optional traits of a kind's estimators. Each function takes an estimator of this kind, and returns it as the
+/// trait.
+#[derive(Clone, Copy)]
+pub struct Traits {
+    pub observation_model: Option<fn(&dyn Estimator) -> &dyn ObservationModel>,
+    /// How agents hand a belief over, and Python copies and saves it.
+    pub handover: Option<fn(&dyn Estimator) -> &dyn Handover>,
+    pub handover_mut: Option<fn(&mut dyn Estimator) -> &mut dyn Handover>,
+    /// For kinds that receive the hidden states.
+    pub told: Option<fn(&mut dyn Estimator) -> &mut dyn Told>,
+    /// Computes the predictions of several estimators of this kind together, with the same results as alone. `None` if
+    /// this would not be faster.
+    pub predict_together: Option<fn(Vec<&mut dyn Estimator>)>,
+}
+
+impl Traits {
+    pub const NONE: Self = Self {
+        observation_model: None,
+        handover: None,
+        handover_mut: None,
+        told: None,
+        predict_together: None,
+    };
+
+    /// Returns the optional traits of a filter.
+    pub const fn of_filter<E: Filter>() -> Self {
+        Self {
+            observation_model: Some(|it| cast::<E>(it)),
+            handover: Some(|it| cast::<E>(it)),
+            handover_mut: Some(|it| cast_mut::<E>(it)),
+            ..Self::NONE
+        }
+    }
+}
+
+/// Returns an estimator as its own type.
+///
+/// # Panics
+/// If it has another type.
+pub fn cast<E: Estimator>(estimator: &dyn Estimator) -> &E {
+    let own = (estimator as &dyn Any).downcast_ref();
+    own.expect("invariant: the kind builds estimators of this type")
+}
+
+/// As [`cast`].
+pub fn cast_mut<E: Estimator>(estimator: &mut dyn Estimator) -> &mut E {
+    let own = (estimator as &mut dyn Any).downcast_mut();
+    own.expect("invariant: the kind builds estimators of this type")
 }
 
 /// The data that correct a belief.

@@ -3,10 +3,9 @@
 //! The kinds differ in their prediction of models of hazards (with or without cavities), and in whether corrections
 //! reach the neighbours of visited cells.
 
-use super::kind::{BeliefKind, Conditions, Input};
+use super::kind::{BeliefKind, Conditions, Input, Traits};
 use anyhow::Result;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, SpatialFilter};
-use emberwatch_model::Model;
 
 pub const KNOWN: BeliefKind = BeliefKind {
     name: "known",
@@ -17,14 +16,13 @@ pub const KNOWN: BeliefKind = BeliefKind {
     is_parallel: false,
     learned_by: None,
     chart: ("known model", [0x00, 0x72, 0xb2]),
-    handover: Some(|model| BayesFilter::handover_of_known(model, false)),
+    traits: Traits::of_filter::<BayesFilter>(),
     build: |conditions| Ok(Box::new(filter(conditions, false)?)),
 };
 
 pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
     name: "known+cavities",
     about: "known, without a cell's influence on itself; with a kernel, the same as known",
-    handover: Some(|model| BayesFilter::handover_of_known(model, true)),
     build: |conditions| Ok(Box::new(filter(conditions, true)?)),
     ..KNOWN
 };
@@ -32,7 +30,7 @@ pub const KNOWN_CAVITIES: BeliefKind = BeliefKind {
 pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
     name: "known+spatial",
     about: "known, where observations also correct neighbouring cells",
-    handover: Some(|model| spatial_handover(model, false)),
+    traits: Traits::of_filter::<SpatialFilter>(),
     build: |conditions| Ok(Box::new(spatial(conditions, false)?)),
     ..KNOWN
 };
@@ -40,7 +38,7 @@ pub const KNOWN_SPATIAL: BeliefKind = BeliefKind {
 pub const KNOWN_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     name: "known+spatial+cavities",
     about: "known+spatial, without a cell's influence on itself; with a kernel, the same as known+spatial",
-    handover: Some(|model| spatial_handover(model, true)),
+    traits: Traits::of_filter::<SpatialFilter>(),
     build: |conditions| Ok(Box::new(spatial(conditions, true)?)),
     ..KNOWN
 };
@@ -58,41 +56,4 @@ fn spatial(conditions: &Conditions<'_>, cavities: bool) -> Result<SpatialFilter>
         conditions.model()?.target_state(),
     );
     Ok(SpatialFilter::new(filter, state, Correlations::default()))
-}
-
-/// Returns the name of the format in which an agent hands over a spatial filter, see `Handover::kind`.
-fn spatial_handover(model: &Model, cavities: bool) -> String {
-    SpatialFilter::handover_of(
-        &BayesFilter::handover_of_known(model, cavities),
-        model.target_state(),
-    )
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::learned::Learned;
-    use emberwatch_belief::estimation::belief::Belief;
-    use emberwatch_model::Shape;
-
-    #[test]
-    fn handover_names_match_the_estimators() {
-        let (model, shape) = (Model::wildfire(), Shape::new(4, 5).expect("test shape"));
-        let conditions = Conditions {
-            model: Some(&model),
-            shape,
-            prior: Some(&Belief::uniform(3, shape)),
-            learned: &Learned::default(),
-        };
-        for kind in [
-            &KNOWN,
-            &KNOWN_CAVITIES,
-            &KNOWN_SPATIAL,
-            &KNOWN_SPATIAL_CAVITIES,
-        ] {
-            let estimator = (kind.build)(&conditions).expect("a filter");
-            let expected = estimator.handover().map(|it| it.kind());
-            assert_eq!(kind.handover.map(|name| name(&model)), expected);
-        }
-    }
 }

@@ -2,11 +2,11 @@
 //!
 //! The kinds differ in whether corrections reach the neighbours of visited cells.
 
-use super::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy};
+use super::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy, Traits};
 use super::world_form::WorldForm;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::parameters::{Parameters, Tables};
-use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, correcting};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Filter, SpatialFilter, correcting};
 use emberwatch_model::Shape;
 
 pub const LEARNED: BeliefKind = BeliefKind {
@@ -22,13 +22,14 @@ pub const LEARNED: BeliefKind = BeliefKind {
         find: |learned| learned.get::<LearnedModel>().map(|model| model as _),
     }),
     chart: ("learned", [0x00, 0x9e, 0x73]),
-    handover: None,
+    traits: Traits::of_filter::<BayesFilter>(),
     build: |conditions| Ok(model(conditions)?.estimator(false, conditions.shape)),
 };
 
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
     about: "learned, where observations also correct neighbouring cells",
+    traits: Traits::of_filter::<SpatialFilter>(),
     build: |conditions| Ok(model(conditions)?.estimator(true, conditions.shape)),
     ..LEARNED
 };
@@ -64,7 +65,7 @@ impl LearnedModel {
     /// Builds an estimator before its first frame.
     ///
     /// If `is_spatial`, corrections reach the neighbours of visited cells.
-    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Box<dyn Estimator> {
+    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Box<dyn Filter> {
         let filter = BayesFilter::learned(&self.tables, self.tables.prior(shape));
         let neighbours = || (self.target, self.correlations.clone());
         correcting(filter, is_spatial.then(neighbours))

@@ -8,20 +8,21 @@
 
 mod sensor;
 
-use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy};
+use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy, Traits, cast_mut};
 use super::learned::{LEARNED, LearnedModel};
 use super::world_form::WorldForm;
 use crate::parallel::in_parallel;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::{check as check_evidence, correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, Handover};
+use emberwatch_belief::estimation::estimator::{
+    Estimator, EstimatorError, Filter, Handover, ObservationModel,
+};
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, Shape};
 use emberwatch_network::{NetworkError, NeuralBelief, Sightings};
 use ndarray::Array2;
 use sensor::{inverse, states_from_observations};
-use std::any::Any;
 use std::borrow::Cow;
 
 pub const NEURAL: BeliefKind = BeliefKind {
@@ -37,7 +38,10 @@ pub const NEURAL: BeliefKind = BeliefKind {
         find: |learned| learned.get::<NeuralModel>().map(|model| model as _),
     }),
     chart: LEARNED.chart,
-    handover: None,
+    traits: Traits {
+        predict_together: Some(predict_together),
+        ..Traits::of_filter::<NeuralEstimator>()
+    },
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
         let model = model.context("checkpoint: expected a learned neural belief, got none")?;
@@ -124,7 +128,7 @@ pub fn estimator(
 pub struct NeuralEstimator {
     network: NeuralBelief,
     /// The filter whose prediction the network corrects, if any.
-    filter: Option<Box<dyn Estimator>>,
+    filter: Option<Box<dyn Filter>>,
     /// The distribution over observations that the filter predicts, shape `[O, H, W]`.
     base: Option<Probabilities>,
     sightings: Sightings,
@@ -142,7 +146,7 @@ impl NeuralEstimator {
     /// Creates the belief before the first frame. `filter` is required if the network was trained to correct one.
     pub fn new(
         network: &NeuralBelief,
-        filter: Option<Box<dyn Estimator>>,
+        filter: Option<Box<dyn Filter>>,
         shape: Shape,
     ) -> Result<Self, NetworkError> {
         let sightings = Sightings::new(shape);
@@ -180,6 +184,11 @@ impl NeuralEstimator {
         Ok(self)
     }
 
+    /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by the refined filter.
+    pub fn base(&self) -> Option<&Probabilities> {
+        self.base.as_ref()
+    }
+
     /// Sets the belief from the predicted distribution of each cell's next observation, `[O, H, W]`.
     fn set_predicted(&mut self, mut observations: Probabilities) {
         if let Some(inverse) = &self.inverse {
@@ -211,28 +220,14 @@ impl Estimator for NeuralEstimator {
         predict_together(vec![self]);
     }
 
-    fn predict_together(&self) -> Option<fn(Vec<&mut dyn Estimator>)> {
-        Some(predict_together)
-    }
-
     fn belief(&self) -> &Belief {
         &self.belief
     }
+}
 
+impl ObservationModel for NeuralEstimator {
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         Some(Cow::Borrowed(&self.likelihood))
-    }
-
-    fn base(&self) -> Option<&Probabilities> {
-        self.base.as_ref()
-    }
-
-    fn handover(&self) -> Option<&dyn Handover> {
-        Some(self)
-    }
-
-    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
-        Some(self)
     }
 }
 
@@ -242,7 +237,7 @@ impl Handover for NeuralEstimator {
         let numbers = numbers.iter().flat_map(|(_, _, numbers)| numbers);
         let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
         let checksum = crc32fast::hash(&bytes);
-        let filter = self.filter.as_ref().and_then(|it| it.handover());
+        let filter = self.filter.as_ref();
         let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
         let sensor = if self.inverse.is_some() {
             let numbers = self.likelihood.iter().flat_map(|p| p.to_le_bytes());
@@ -257,8 +252,8 @@ impl Handover for NeuralEstimator {
     }
 
     fn to_bytes(&self) -> Vec<u8> {
-        let filter = self.filter.as_ref().and_then(|it| it.handover());
-        let filter = filter.map_or(Vec::new(), Handover::to_bytes);
+        let filter = self.filter.as_ref();
+        let filter = filter.map_or(Vec::new(), |it| it.to_bytes());
         [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()
     }
 
@@ -277,7 +272,7 @@ impl Handover for NeuralEstimator {
         let Some((belief, sightings)) = belief.zip(sightings) else {
             return false;
         };
-        let filter = self.filter.as_mut().and_then(|it| it.handover_mut());
+        let filter = self.filter.as_mut();
         if !filter.map_or(rest.is_empty(), |filter| filter.restore(rest)) {
             return false;
         }
@@ -289,16 +284,8 @@ impl Handover for NeuralEstimator {
 
 /// Runs the predictions of several estimators. Worlds with the same network and grid share one forward pass.
 fn predict_together(estimators: Vec<&mut dyn Estimator>) {
-    let (mut networks, mut others) = (Vec::<&mut NeuralEstimator>::new(), Vec::new());
-    for estimator in estimators {
-        if (&*estimator as &dyn Any).is::<NeuralEstimator>() {
-            let estimator: &mut dyn Any = estimator;
-            networks.extend(estimator.downcast_mut::<NeuralEstimator>());
-        } else {
-            others.push(estimator);
-        }
-    }
-    in_parallel(others, |estimator| estimator.predict());
+    let networks = estimators.into_iter().map(cast_mut::<NeuralEstimator>);
+    let mut networks: Vec<&mut NeuralEstimator> = networks.collect();
     in_parallel(networks.iter_mut(), |it| it.advance());
     networks.sort_by_key(|it| it.pass_key());
     for group in networks.chunk_by_mut(|a, b| a.pass_key() == b.pass_key()) {
@@ -348,7 +335,7 @@ fn belief(probabilities: Probabilities) -> Belief {
 }
 
 /// Returns the distribution of each cell's next observation, `[O, H, W]`, under a belief about X_{k+1}.
-fn predicted_observations(estimator: &dyn Estimator) -> Option<Probabilities> {
+fn predicted_observations(estimator: &dyn Filter) -> Option<Probabilities> {
     let likelihood = estimator.likelihood()?;
     Some(observations(estimator.belief(), &likelihood))
 }

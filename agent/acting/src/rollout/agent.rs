@@ -1,5 +1,6 @@
 //! One agent in one world: plan, correct, predict. It does not communicate.
 
+use crate::beliefs::Traits;
 use crate::config::AgentConfig;
 use crate::parallel::in_parallel;
 use crate::policy::Policy;
@@ -229,7 +230,8 @@ impl Agent {
 
     /// Scores the belief's prediction of a frame. Returns `None` if the estimator does not predict frames.
     pub fn score(&self, frame: &Frame) -> Option<Score> {
-        let likelihood = self.estimator.likelihood()?;
+        let observation_model = self.traits().observation_model?(&*self.estimator);
+        let likelihood = observation_model.likelihood()?;
         Some(score(self.estimator.belief(), &likelihood, frame))
     }
 
@@ -239,8 +241,8 @@ impl Agent {
     /// If the frame is impossible under the belief, or an oracle lacks the truth. The belief then remains unchanged.
     pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<()> {
         self.estimator.correct(frame)?;
-        if let Some(told) = self.estimator.told() {
-            told.tell(truth.context(NO_TRUTH)?)?;
+        if let Some(told) = self.traits().told {
+            told(&mut *self.estimator).tell(truth.context(NO_TRUTH)?)?;
         }
         self.memory.see(frame);
         Ok(())
@@ -256,24 +258,27 @@ impl Agent {
         Self::predict_all([self]);
     }
 
-    /// Predicts the beliefs of several agents, as [`Self::predict`] does for one.
+    /// Predicts the beliefs of several agents, all of the same kind, as [`Self::predict`] does for one.
     pub fn predict_all<'a>(agents: impl IntoIterator<Item = &'a mut Self>) {
-        let (mut together, mut alone) = (Vec::new(), Vec::new());
+        let mut together = None;
+        let mut estimators = Vec::new();
         for agent in agents {
             if agent.basis == BasisKind::Estimate {
                 agent.estimate = Some(agent.estimator.belief().clone());
             }
-            let estimator = &mut *agent.estimator;
-            match estimator.predict_together() {
-                Some(_) => together.push(estimator),
-                None => alone.push(estimator),
+            together = agent.traits().predict_together;
+            estimators.push(&mut *agent.estimator);
+        }
+        match together {
+            Some(predict) => predict(estimators),
+            None => {
+                in_parallel(estimators, Estimator::predict);
             }
         }
-        in_parallel(alone, Estimator::predict);
-        let predict = together.first().and_then(|first| first.predict_together());
-        if let Some(predict) = predict {
-            predict(together);
-        }
+    }
+
+    fn traits(&self) -> &Traits {
+        &self.policy.belief.traits
     }
 
     /// Returns the belief, which is about X_k after `correct` and about X_{k+1} after `predict`.
@@ -287,14 +292,14 @@ impl Agent {
 
     /// Returns the name of the format of [`Self::handover`]. `None` if no other agent can resume from this agent.
     pub fn handover_kind(&self) -> Option<String> {
-        let kind = self.estimator.handover()?.kind();
-        Some(handover_of(&kind))
+        let kind = self.traits().handover?(&*self.estimator).kind();
+        Some(format!("{kind}; freshness [H, W] as f32, rewards, paths"))
     }
 
     /// Encodes the agent's knowledge of its world before the frame of X_{k+1}: the estimator's state, and the agent's
     /// memory.
     pub fn handover(&self) -> Option<Vec<u8>> {
-        let estimator = self.estimator.handover()?.to_bytes();
+        let estimator = self.traits().handover?(&*self.estimator).to_bytes();
         Some([estimator, self.memory.to_bytes()].concat())
     }
 
@@ -309,8 +314,8 @@ impl Agent {
         let Some(memory) = Memory::from_bytes(memory, shape) else {
             return false;
         };
-        let own = self.estimator.handover_mut();
-        let is_taken = own.is_some_and(|own| own.restore(estimator));
+        let handover = self.traits().handover_mut;
+        let is_taken = handover.is_some_and(|own| own(&mut *self.estimator).restore(estimator));
         if is_taken {
             self.memory = memory;
         }
@@ -336,9 +341,4 @@ impl Agent {
     pub fn policy(&self) -> &Policy {
         &self.policy
     }
-}
-
-/// Returns the name of the format of an agent's handover, given the format of its estimator's handover.
-pub fn handover_of(kind: &str) -> String {
-    format!("{kind}; freshness [H, W] as f32, rewards, paths")
 }

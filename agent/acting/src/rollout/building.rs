@@ -1,8 +1,8 @@
 //! Builds a policy's agent from its belief, its planner and its chooser.
 
 use super::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
-use crate::beliefs::autoencoder::AutoencoderModel;
-use crate::beliefs::{Conditions, WorldForm};
+use crate::beliefs::autoencoder::{AutoencoderEstimator, AutoencoderModel};
+use crate::beliefs::{Conditions, WorldForm, cast};
 use crate::config::AgentConfig;
 use crate::learned::Learned;
 use crate::policy::{BY_OPTIONS, Goal, Policy, network_choices};
@@ -93,8 +93,7 @@ fn decider(config: &AgentConfig, network: Arc<AutoencoderModel>) -> Decider {
     let objectives = choices.map(|choice| choice.objective(network.target, config));
     let objectives: Vec<Objective> = objectives.collect();
     Box::new(move |estimator| {
-        let hidden = estimator.hidden();
-        let hidden = hidden.expect("invariant: it decides for an autoencoder");
+        let hidden = cast::<AutoencoderEstimator>(estimator).hidden();
         objectives[network.dqn.best(hidden)]
     })
 }

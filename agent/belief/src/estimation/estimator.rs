@@ -2,7 +2,6 @@
 
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::{Belief, BeliefError};
-use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, Grid};
 use ndarray::Array2;
 use std::any::Any;
@@ -11,10 +10,7 @@ use std::error::Error as StdError;
 use thiserror::Error;
 
 /// An estimator of one world's hidden states. In each step, [`Self::correct`] updates the belief with the frame, then
-/// [`Self::predict`] moves the belief one step ahead.
-///
-/// Every estimator implements [`Self::correct`], [`Self::predict`] and [`Self::belief`]. All other methods are optional
-/// and have defaults.
+/// [`Self::predict`] moves the belief one step ahead. What only some kinds can do is in traits of their own.
 pub trait Estimator: Send + Any {
     /// Corrects the belief with the frame of X_k (eq. 5).
     ///
@@ -28,57 +24,23 @@ pub trait Estimator: Send + Any {
     /// Predicts the belief about X_{k+1} from the belief about X_k (eq. 6).
     fn predict(&mut self);
 
-    /// Returns a function that computes the predictions of several estimators together, with the same results as a call
-    /// of [`Self::predict`] on each. The list of estimators may contain any kinds. Returns `None` if this would not be
-    /// faster.
-    fn predict_together(&self) -> Option<fn(Vec<&mut dyn Estimator>)> {
-        None
-    }
-
     /// Returns the belief: about X_k after [`Self::correct`], about X_{k+1} after [`Self::predict`].
     fn belief(&self) -> &Belief;
-
-    /// Returns the approximate memory use of the estimator in bytes. The default is four times the size of the belief,
-    /// which accounts for the belief, its predictor and work space.
-    fn memory_bytes(&self) -> usize {
-        4 * size_of_val(self.belief().as_slice())
-    }
-
-    /// Returns `P(y | x)`, shape `[S, O]`, if observations can be predicted from the belief.
-    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
-        None
-    }
-
-    /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by a base filter. Only
-    /// estimators that refine the predictions of another filter have a base filter.
-    fn base(&self) -> Option<&Probabilities> {
-        None
-    }
-
-    /// Returns the hidden vector `h_k` from which the belief is computed. It is the input of a DQN (paper section
-    /// III.E).
-    fn hidden(&self) -> Option<&[f32]> {
-        None
-    }
-
-    /// Returns the interface that saves the estimator's state, if the state can be saved.
-    fn handover(&self) -> Option<&dyn Handover> {
-        None
-    }
-
-    /// Returns the interface that restores a saved state, if the state can be saved with [`Self::handover`].
-    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
-        None
-    }
-
-    /// Returns the interface that receives the hidden states, if the estimator is an oracle.
-    fn told(&mut self) -> Option<&mut dyn Told> {
-        None
-    }
 }
 
+/// An estimator from whose belief observations can be predicted.
+pub trait ObservationModel {
+    /// Returns `P(y | x)`, shape `[S, O]`. `None` if it cannot be computed, as when a network's device failed.
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>>;
+}
+
+/// A filter whose prediction another estimator can refine.
+pub trait Filter: Estimator + ObservationModel + Handover {}
+
+impl<T: Estimator + ObservationModel + Handover> Filter for T {}
+
 /// An estimator whose state can be saved as bytes after the prediction of X_{k+1}, and restored by another estimator of
-/// the same kind.
+/// the same kind. Estimators are copied and handed over this way, too.
 pub trait Handover {
     /// Returns a description of the byte format. Only estimators with the same description can read the bytes.
     fn kind(&self) -> String;

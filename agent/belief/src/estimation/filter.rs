@@ -6,7 +6,7 @@
 
 use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
-use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
+use crate::estimation::estimator::{Estimator, EstimatorError, Handover, ObservationModel};
 use crate::estimation::parameters::Tables;
 use crate::estimation::prediction::Prediction;
 use emberwatch_model::frame::Frame;
@@ -81,11 +81,6 @@ impl BayesFilter {
         }
     }
 
-    /// Returns the [`Handover::kind`] of filters of a known model.
-    pub fn handover_of_known(model: &Model, cavities: bool) -> String {
-        handover_of(known_checksum(model), cavities && model.hazards().is_some())
-    }
-
     /// Returns the number of bytes of [`Handover::to_bytes`].
     pub(super) fn n_bytes(&self) -> usize {
         4 * self.belief.as_slice().len() + self.prediction.n_bytes()
@@ -117,32 +112,24 @@ impl Estimator for BayesFilter {
         }
     }
 
-    fn memory_bytes(&self) -> usize {
-        let belief = size_of_val(self.belief.as_slice()) + size_of_val(&*self.before);
-        size_of::<Self>() + belief + self.prediction.memory_bytes()
-    }
-
     /// Returns the predictor `u_k` before [`Estimator::correct`], and the posterior `p_k` after it.
     fn belief(&self) -> &Belief {
         &self.belief
     }
+}
 
+impl ObservationModel for BayesFilter {
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         Some(Cow::Borrowed(&self.likelihood))
-    }
-
-    fn handover(&self) -> Option<&dyn Handover> {
-        Some(self)
-    }
-
-    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
-        Some(self)
     }
 }
 
 impl Handover for BayesFilter {
     fn kind(&self) -> String {
-        handover_of(self.checksum, self.prediction.has_cavities())
+        let has_cavities = self.prediction.has_cavities();
+        let cavities = if has_cavities { " with cavities" } else { "" };
+        let checksum = self.checksum;
+        format!("bayes_filter{cavities} {checksum:08x}, probabilities [S, H, W] as f32")
     }
 
     fn to_bytes(&self) -> Vec<u8> {
@@ -165,11 +152,6 @@ impl Handover for BayesFilter {
         }
         true
     }
-}
-
-fn handover_of(checksum: u32, has_cavities: bool) -> String {
-    let kind = if has_cavities { " with cavities" } else { "" };
-    format!("bayes_filter{kind} {checksum:08x}, probabilities [S, H, W] as f32")
 }
 
 fn known_checksum(model: &Model) -> u32 {

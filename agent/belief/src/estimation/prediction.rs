@@ -73,17 +73,6 @@ impl Prediction {
         Self(Kind::ratio(transition, belief))
     }
 
-    /// Returns the approximate memory use in bytes.
-    pub fn memory_bytes(&self) -> usize {
-        match &self.0 {
-            Kind::Ratio {
-                transition,
-                predictor,
-            } => transition.memory_bytes() + 4 * predictor.len(),
-            Kind::Hazards(hazards) => hazards.memory_bytes(),
-        }
-    }
-
     /// Returns whether there are cavities. If so, [`Self::correct`] must update them after each correction of the
     /// belief.
     pub fn has_cavities(&self) -> bool {

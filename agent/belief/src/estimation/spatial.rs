@@ -8,7 +8,7 @@
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{Ages, Correlations, Evidence};
-use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
+use crate::estimation::estimator::{Estimator, EstimatorError, Filter, Handover, ObservationModel};
 use crate::estimation::filter::BayesFilter;
 use crate::estimation::innovation::Innovation;
 use crate::estimation::spread::Spread;
@@ -37,7 +37,7 @@ pub struct SpatialFilter {
 pub fn correcting(
     filter: BayesFilter,
     neighbours: Option<(usize, Correlations)>,
-) -> Box<dyn Estimator> {
+) -> Box<dyn Filter> {
     match neighbours {
         Some((state, correlations)) => Box::new(SpatialFilter::new(filter, state, correlations)),
         None => Box::new(filter),
@@ -45,12 +45,6 @@ pub fn correcting(
 }
 
 impl SpatialFilter {
-    /// Returns the [`Handover::kind`] of spatial filters. `filter` is the kind of the wrapped filter, and `state` is
-    /// the state for which corrections are spread to neighbours.
-    pub fn handover_of(filter: &str, state: usize) -> String {
-        format!("spatial {filter}, ages and sums of state {state} as bincode")
-    }
-
     /// Wraps a filter. Corrections to the probability of `state` (the *paying state*, which has the highest reward) are
     /// spread to neighbours.
     ///
@@ -129,31 +123,21 @@ impl Estimator for SpatialFilter {
         self.ages.grow();
     }
 
-    fn memory_bytes(&self) -> usize {
-        // `Ages` and `Spread` together use 10 bytes per cell.
-        self.filter.memory_bytes() + size_of::<Self>() + 10 * self.ages.as_slice().len()
-    }
-
     fn belief(&self) -> &Belief {
         self.filter.belief()
     }
+}
 
+impl ObservationModel for SpatialFilter {
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         self.filter.likelihood()
-    }
-
-    fn handover(&self) -> Option<&dyn Handover> {
-        Some(self)
-    }
-
-    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
-        Some(self)
     }
 }
 
 impl Handover for SpatialFilter {
     fn kind(&self) -> String {
-        Self::handover_of(&self.filter.kind(), self.state)
+        let (filter, state) = (self.filter.kind(), self.state);
+        format!("spatial {filter}, ages and sums of state {state} as bincode")
     }
 
     fn to_bytes(&self) -> Vec<u8> {

@@ -42,10 +42,6 @@ impl Estimator for Oracle {
     fn belief(&self) -> &Belief {
         &self.belief
     }
-
-    fn told(&mut self) -> Option<&mut dyn Told> {
-        Some(self)
-    }
 }
 
 impl Told for Oracle {

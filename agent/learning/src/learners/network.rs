@@ -17,7 +17,7 @@ use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds};
 use crate::learners::update::ModelUpdate;
 use crate::reward::met;
 use emberwatch_acting::beliefs::autoencoder::AutoencoderEstimator;
-use emberwatch_acting::beliefs::numbered_states;
+use emberwatch_acting::beliefs::{cast, numbered_states};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::policy::{Policy, network_choices};
 use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
@@ -136,9 +136,8 @@ impl NetworkLearner {
 
     /// Returns the input of the next action: `h_{k+1}`, which depends on the last frame.
     fn input(&self) -> Vec<f32> {
-        let hidden = self.at_world().agent.estimator().hidden();
-        let hidden = hidden.expect("invariant: its estimator is an autoencoder");
-        hidden.to_vec()
+        let estimator = self.at_world().agent.estimator();
+        cast::<AutoencoderEstimator>(estimator).hidden().to_vec()
     }
 
     fn decide(&self) -> Decision {

@@ -18,14 +18,14 @@ use crate::models::{SavedNeuralModel, corrected_tensors};
 use crate::reward::{RewardEstimate, met};
 use anyhow::Result;
 use emberwatch_acting::beliefs::learned::LearnedModel;
-use emberwatch_acting::beliefs::neural::{NeuralModel, estimator};
-use emberwatch_acting::beliefs::{LEARNED, LearnedBelief, NEURAL as BELIEF, numbered_states};
+use emberwatch_acting::beliefs::neural::{NeuralEstimator, NeuralModel, estimator};
+use emberwatch_acting::beliefs::{LEARNED, LearnedBelief, NEURAL as BELIEF, cast, numbered_states};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::parallel::in_parallel;
 use emberwatch_acting::policy::Policy;
 use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
 use emberwatch_messages::observation::Observation;
-use emberwatch_model::Move;
+use emberwatch_model::{Move, Probabilities};
 use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_network::{Device, NeuralBelief};
 
@@ -197,7 +197,7 @@ impl Actor for NeuralLearner {
             let flight = self.worlds.airspace.fly(start, &run.path);
             self.reward
                 .add(&met(belief, &flight.visited), record.reward);
-            let base = run.rollout.agent.estimator().base();
+            let base = base(&run.rollout);
             self.replay.push(robot, &observation.frame, base);
         }
         let n_robots = records.len() as u64;
@@ -215,7 +215,7 @@ impl Learner for NeuralLearner {
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
         let mut rollout = self.rollout_at(observation)?;
         self.replay.begin(robot, self.worlds.shape());
-        let base = rollout.agent.estimator().base();
+        let base = base(&rollout);
         self.replay.push(robot, &rollout.observation().frame, base);
         rollout.correct()?;
         rollout.agent.predict();
@@ -289,4 +289,9 @@ impl Learner for NeuralLearner {
         let tensors = self.network.named_tensors()?.into_iter().chain(filter);
         Ok(Contents::new(tensors, &state))
     }
+}
+
+/// Returns the distribution of each cell's next observation that the refined filter predicts, shape `[O, H, W]`.
+fn base(rollout: &Rollout) -> Option<&Probabilities> {
+    cast::<NeuralEstimator>(rollout.agent.estimator()).base()
 }

@@ -34,7 +34,7 @@ fn visited_cells_are_certain_until_the_next_step() {
     check(&estimator, 1, [1.0 / 3.0; 3]);
 }
 
-fn filter() -> Box<dyn Estimator> {
+fn filter() -> Box<dyn Filter> {
     let model = emberwatch_model::Model::wildfire();
     let filter = BayesFilter::known(&model, Belief::uniform(3, shape()), false);
     Box::new(filter.expect("a filter"))
@@ -73,7 +73,7 @@ fn predictions_together_equal_predictions_alone() {
         network
     });
     let estimators = || -> Vec<Box<dyn Estimator>> {
-        let mut all = vec![filter()];
+        let mut all = Vec::<Box<dyn Estimator>>::new();
         // The two networks alternate, each with and without a filter to correct.
         for index in 0..8 {
             let below = (index % 4 > 1).then(filter);

@@ -143,9 +143,9 @@ fn decisions_use_the_beam_width_that_they_were_learned_with() {
 fn a_network_decides_from_the_hidden_vector_after_the_frame() {
     let learned = network(BasisKind::Predictor, |_| true).autoencoder;
     let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");
-    let before = estimator.hidden().expect("a vector").to_vec();
+    let before = estimator.hidden().to_vec();
     estimator.correct(&world(0).1).expect("possible");
-    let after = estimator.hidden().expect("a vector").to_vec();
+    let after = estimator.hidden().to_vec();
     let network = network(BasisKind::Predictor, |dqn| {
         dqn.best(&before) != dqn.best(&after)
     });

@@ -136,18 +136,6 @@ impl HazardPrediction {
         }
     }
 
-    pub fn memory_bytes(&self) -> usize {
-        let changes = self.changes.iter().flatten();
-        let numbers = changes.flat_map(|change| {
-            let neighbours = change.neighbours.iter();
-            let sources = neighbours.flat_map(|it| it.sources.iter().map(|source| &source.1));
-            sources.chain([&change.base])
-        });
-        let tables: usize = numbers.map(Values::n_bytes).sum();
-        let n_lanes = self.n_states * (1 + self.offsets.len());
-        2 * (size_of_val(&*self.beliefs.probabilities) + n_lanes * size_of::<Lanes>()) + tables
-    }
-
     /// Moves the belief, shape `[S, H, W]`, and the cavities one step ahead.
     pub fn predict(&mut self, belief: &mut [f32]) {
         let expected = self.n_states * self.shape.n_cells();
@@ -350,13 +338,6 @@ impl Values {
         match self {
             Self::One(number) => add_product(to, &[*number; LANES], by),
             Self::Plane(numbers) => add_product(to, lanes_from(numbers, place), by),
-        }
-    }
-
-    fn n_bytes(&self) -> usize {
-        match self {
-            Self::One(_) => 4,
-            Self::Plane(numbers) => 4 * numbers.len(),
         }
     }
 }
