@@ -4,7 +4,7 @@ use emberwatch_protocol::client::{Claim, Observation};
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::{Client, Move};
 use std::ops::Range;
-use tests::harness::{PATIENCE, Paths, Server, fly, reset};
+use tests::harness::{PATIENCE, Paths, Server, reset, send_paths};
 
 /// Number of seeds, with one world each.
 const N_SEEDS: u32 = 8;
@@ -42,7 +42,7 @@ fn reference(size: &str) -> Vec<Trajectory> {
         reset(&mut client, u64::from(seed));
         let flights = paths(seed).into_iter();
         flights
-            .map(|path| without_episode(fly(&mut client, path)))
+            .map(|path| without_episode(send_paths(&mut client, path)))
             .collect()
     };
     (0..N_SEEDS).map(&mut trajectory).collect()
@@ -109,7 +109,7 @@ fn worlds_do_not_notice_who_acts_on_them_or_where_robots_fly() {
     let mut clients = servers.each_ref().map(|server| server.acquire(0..1));
     let [one, other] = &mut clients;
     for (mine, theirs) in paths(1).into_iter().zip(paths(2)) {
-        let (mine, theirs) = (fly(one, mine), fly(other, theirs));
+        let (mine, theirs) = (send_paths(one, mine), send_paths(other, theirs));
         assert_eq!(mine.frame, theirs.frame);
         assert_eq!(mine.world.n_target_cells, theirs.world.n_target_cells);
     }

@@ -6,8 +6,8 @@ use emberwatch_protocol::message::{FrameHeader, VERSION};
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::{Coverage, UNOBSERVED};
 use tests::harness::{
-    PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, path_of, reset,
-    robots_of, seen_by, seen_in, service_files,
+    PATIENCE, Paths, SMALL, Server, eventually, frames_until, new_instance, path_of, reset,
+    robots_of, seen_by, seen_in, send_paths, service_files,
 };
 
 /// Number of cells of a world on a [`SMALL`] server.
@@ -33,7 +33,7 @@ fn a_reading_observer_gets_every_frame_with_its_path() {
     let mut start = (0, 0);
     for step in 1..=30 {
         let path = paths.next(6);
-        let answer = fly(&mut client, path.clone());
+        let answer = send_paths(&mut client, path.clone());
         let new = frames_until(&observer, 1, step);
         let sample = new.last().expect("a frame");
         assert_eq!((seen_in(sample), path_of(sample)), (seen_by(&answer), path));
@@ -84,7 +84,7 @@ fn a_stalled_observer_sees_a_gap_and_slows_nobody() {
     frames_until(&reading, 0, 0);
     let mut read = Vec::new();
     for (step, path) in (1..).zip(Paths::new(4).take(6, 2 * FRAME_BUFFER)) {
-        fly(&mut client, path);
+        send_paths(&mut client, path);
         read.extend(frames_until(&reading, 0, step));
     }
     assert_gapless(&read);
@@ -99,7 +99,7 @@ fn hidden_states_come_on_request_and_agree_with_what_is_told() {
     let flags = "--height 9 --width 6 --moves 8 --burn-in 3000 --coverage full";
     let server = Server::start(flags);
     let truth = Observer::truth(&server.instance).expect("the truth channel");
-    fly(&mut server.acquire(0..1), Paths::new(0).next(8));
+    send_paths(&mut server.acquire(0..1), Paths::new(0).next(8));
     server.status();
     assert!(
         truth.try_receive().expect("receive").is_none(),
@@ -110,7 +110,7 @@ fn hidden_states_come_on_request_and_agree_with_what_is_told() {
     let truth = Observer::truth(&server.instance).expect("the truth channel");
     let mut client = server.acquire(0..1);
     for (step, path) in (1..=50).zip(Paths::new(1).take(8, 50)) {
-        let told = fly(&mut client, path);
+        let told = send_paths(&mut client, path);
         let mut sample = None;
         assert!(eventually(PATIENCE, || {
             sample = truth.try_receive().expect("receive");

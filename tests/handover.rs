@@ -7,7 +7,9 @@ use emberwatch_protocol::control::{LeftPart, Reply, Request};
 use emberwatch_protocol::message::{FrameHeader, Status};
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::{Client, Model, Move};
-use tests::harness::{PATIENCE, Paths, Program, SMALL, Server, fly, frames_until, path_of, seed};
+use tests::harness::{
+    PATIENCE, Paths, Program, SMALL, Server, frames_until, path_of, seed, send_paths,
+};
 use tests::wire::{RawClient, Wire, recall_header, step_body};
 
 /// A world with many fires.
@@ -138,7 +140,7 @@ fn kept_frames_are_those_that_were_answered() {
 fn a_left_belief_goes_whole_to_its_robot_and_step_only() {
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let mut client = server.acquire(0..1);
-    fly(&mut client, Paths::new(0).next(6));
+    send_paths(&mut client, Paths::new(0).next(6));
     let left = |client: &mut Client, kind| left_belief(client, 0, kind).expect("asked");
     assert_eq!(left(&mut client, "kind"), None);
     let bytes: Vec<u8> = (0..35 * 76 + 32_768).map(|n| n as u8).collect();
@@ -183,7 +185,7 @@ fn a_left_belief_goes_whole_to_its_robot_and_step_only() {
     assert_eq!(leave(1, 0, 0, 1, "AAAA").status(), Status::Malformed);
     assert_eq!(leave(1, 0, 1, 2, "AQ=="), Reply::Done);
     assert!(matches!(wire.ask(&ask(1)), Reply::Belief { data, .. } if data == "AAE="));
-    fly(&mut client, Paths::new(1).next(6));
+    send_paths(&mut client, Paths::new(1).next(6));
     assert_eq!(left(&mut client, "kind"), None, "another step");
 }
 
@@ -214,6 +216,6 @@ fn an_agent_that_lacks_something_takes_no_robot() {
     ] {
         let flags = format!("--policy {policy} --takeover --steps 1");
         run(&server, &flags).ends(1).check_says(words);
-        fly(&mut holder, Paths::new(1).next(6));
+        send_paths(&mut holder, Paths::new(1).next(6));
     }
 }

@@ -10,7 +10,7 @@ use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::{Client, Connection};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, prlimit};
 use std::time::Duration;
-use tests::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
+use tests::harness::{PATIENCE, Paths, Program, Server, eventually, send_paths};
 use tests::siege::{FLAGS, besiege};
 use tests::wire::{RawClient, Wire, answer, client, control_header, step_body, step_header};
 
@@ -98,7 +98,10 @@ fn clients_that_come_and_go_disturb_nobody() {
             1 => drop((step, wire, control)),
             _ => drop((answer(&step, PATIENCE), control, wire)),
         }
-        assert_eq!(fly(&mut bystander, Paths::new(0).next(6)).world.step, round);
+        assert_eq!(
+            send_paths(&mut bystander, Paths::new(0).next(6)).world.step,
+            round
+        );
     }
     server.acquire(1..3);
 }
@@ -120,7 +123,10 @@ fn abandoned_requests_during_a_reset_leak_nothing() {
     drop(reset);
     for step in 1..=50 {
         let renew = send(format!(r#"{{"op":"renew","lease":{lease}}}"#));
-        assert_eq!(fly(&mut bystander, Paths::new(0).next(6)).world.step, step);
+        assert_eq!(
+            send_paths(&mut bystander, Paths::new(0).next(6)).world.step,
+            step
+        );
         server.status();
         drop(renew);
     }

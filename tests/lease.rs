@@ -7,7 +7,7 @@ use emberwatch_protocol::control::{Reply, Request};
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::{Client, Connection};
 use std::time::Duration;
-use tests::harness::{PATIENCE, Paths, SMALL, Server, fly, seed};
+use tests::harness::{PATIENCE, Paths, SMALL, Server, seed, send_paths};
 use tests::wire::{RawClient, Wire};
 
 fn check<T>(result: Result<T, ConnectionError>, expected: Status, expected_detail: u64) {
@@ -28,7 +28,7 @@ fn a_takeover_ends_the_lease_and_keeps_the_world() {
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1..3).lease;
     let mut former = server.acquire(0..1);
-    let last = fly(&mut former, Paths::new(1).next(6));
+    let last = send_paths(&mut former, Paths::new(1).next(6));
     let mut next = server.take_over(0..2);
     check(former.step(0..1, &path), Status::LeaseLost, us);
     check(former.reset(&[seed(0, None)]), Status::LeaseLost, us);
@@ -90,7 +90,7 @@ fn a_seventeenth_client_is_told_the_limit_and_others_go_on() {
         problem.contains("at most 16 clients at a time"),
         "{problem}"
     );
-    fly(&mut holder, Paths::new(0).next(6));
+    send_paths(&mut holder, Paths::new(0).next(6));
     drop(others);
     server.connect();
 }

@@ -10,7 +10,7 @@ use emberwatch_protocol::model::Description;
 use emberwatch_protocol::{Client, Grid, Shape};
 use ndarray::{Array3, Axis};
 use ndarray_npy::WriteNpyExt;
-use tests::harness::{AGENT, Folder, Paths, SERVER, Server, fly, reset};
+use tests::harness::{AGENT, Folder, Paths, SERVER, Server, reset, send_paths};
 use tests::meter::memory;
 
 const N_MOVES: usize = 4;
@@ -102,7 +102,7 @@ fn episode(client: &mut Client, truth: &TruthFeed, seed: u64) -> Vec<Grid<u8>> {
     let mut shown = truth.states(0..1, &[seed], 0).expect("truth");
     let mut paths = Paths::new(seed);
     loop {
-        let seen = fly(client, paths.next(N_MOVES));
+        let seen = send_paths(client, paths.next(N_MOVES));
         let states = truth.states(0..1, &[seed], seen.world.step).expect("truth");
         assert_eq!(seen.frame.values(), states[0], "sensors that never err");
         let n_burning = states[0].iter().filter(|&&state| state == 1).count();

@@ -12,7 +12,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tests::harness::{
-    Ended, Folder, Paths, Program, SERVER, SMALL, Server, fly, fly_on, frames_until, new_instance,
+    Ended, Folder, Paths, Program, SERVER, SMALL, Server, fly_on, frames_until, new_instance,
+    send_paths,
 };
 
 /// Creates a temporary folder. Returns the folder, and the path of a file in it that does not exist yet.
@@ -92,7 +93,7 @@ fn a_recording_holds_byte_for_byte_what_observers_received() {
     let mut client = server.acquire(1..2);
     let (mut paths, mut seen) = (Paths::new(3), Vec::new());
     for step in 1..=40 {
-        fly(&mut client, paths.next(6));
+        send_paths(&mut client, paths.next(6));
         seen.extend(frames_until(&observer, 1, step));
     }
     let last = seen.last().expect("frames").header.sequence;

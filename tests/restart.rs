@@ -9,7 +9,8 @@ use rustix::process::Signal;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use tests::harness::{
-    ENDLESS, PATIENCE, Paths, Program, SMALL, Server, fly, new_instance, reset, service_files,
+    ENDLESS, PATIENCE, Paths, Program, SMALL, Server, new_instance, reset, send_paths,
+    service_files,
 };
 
 fn start_agent(instance: &Instance) -> Program {
@@ -55,7 +56,7 @@ fn clients_learn_of_a_killed_server_and_the_next_takes_its_place() {
     let instance = new_instance();
     let first = Server::start_on(&instance, SMALL);
     let mut client = first.acquire(0..1);
-    let step = fly(&mut client, Paths::new(0).next(6));
+    let step = send_paths(&mut client, Paths::new(0).next(6));
     let mut waiting = first.connect();
     first.program.stop();
     let refused = std::thread::scope(|scope| {
@@ -70,7 +71,7 @@ fn clients_learn_of_a_killed_server_and_the_next_takes_its_place() {
     assert!(is_told, "{refused:?}");
     let mut next = second.acquire(0..1);
     // The new server starts from the same seed, so the first step is the same.
-    assert_eq!(fly(&mut next, Paths::new(0).next(6)), step);
+    assert_eq!(send_paths(&mut next, Paths::new(0).next(6)), step);
 }
 
 #[test]
@@ -118,7 +119,7 @@ fn a_clean_stop_leaves_nothing_behind() {
     agent.until(|| is_held_by(&server, &agent));
     let mut client = server.acquire(1..2);
     reset(&mut client, 3);
-    fly(&mut client, Paths::new(0).next(6));
+    send_paths(&mut client, Paths::new(0).next(6));
     let files = shared_files(&[server.program.pid(), agent.pid()]);
     assert!(files.len() > 5, "{files:?}");
     client.release().expect("release");

@@ -13,8 +13,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use std::path::{Path, PathBuf};
 use tests::harness::{
-    ENDLESS, Folder, PATIENCE, Paths, SERVER, SMALL, Server, fly, fly_on, frames_until,
-    new_instance, reset, small_spec,
+    ENDLESS, Folder, PATIENCE, Paths, SERVER, SMALL, Server, fly_on, frames_until, new_instance,
+    reset, send_paths, small_spec,
 };
 use tests::wire::{RawClient, Wire, control_header};
 
@@ -83,7 +83,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     let file = folder.word("lab.snapshot");
     let server = Server::start(&format!("{SMALL} --worlds 3 --lease-millis 86400000"));
     let mut second = server.acquire(1..2);
-    fly(&mut second, Paths::new(3).next(N_MOVES));
+    send_paths(&mut second, Paths::new(3).next(N_MOVES));
     let part = format!("snapshot {file} --first-world 1");
     server.command(&part).check(0);
     let observer = Observer::frames(&server.instance).expect("observe");
@@ -145,7 +145,7 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
     let folder = Folder::default();
     let file = folder.word("lab.snapshot");
     let server = Server::start(SMALL);
-    fly(&mut server.acquire(0..1), Paths::new(1).next(N_MOVES));
+    send_paths(&mut server.acquire(0..1), Paths::new(1).next(N_MOVES));
     server.command(&format!("snapshot {file}")).check(0);
     let (whole, before) = (folder.bytes("lab.snapshot"), server.observe(0));
     let (mut version, mut damaged) = (whole.clone(), whole.clone());
@@ -261,9 +261,9 @@ fn servers_killed_at_any_moment_come_back_to_a_step_that_was() {
         for _ in 0..rng.random_range(1..200) {
             let k = seen.world.step as usize;
             assert_eq!(expected.get(k), Some(&seen), "step {k}");
-            seen = fly(&mut client, path(k));
+            seen = send_paths(&mut client, path(k));
             if expected.len() == k + 1 {
-                expected.push(fly(&mut undisturbed, path(k)));
+                expected.push(send_paths(&mut undisturbed, path(k)));
             }
         }
         server.kill();

@@ -18,7 +18,7 @@ use rustix::process::Signal;
 use std::ops::Range;
 use std::time::Instant;
 use tests::harness::{
-    AGENT, PATIENCE, Paths, Program, Seen, Server, eventually, frames_until, robots_of,
+    AGENT, AgentObservation, PATIENCE, Paths, Program, Server, eventually, frames_until, robots_of,
 };
 use tests::mirror::{Mirror, PacedWorld};
 use tests::wire::{
@@ -71,7 +71,7 @@ impl Flyer {
     }
 
     /// Waits for the answer to a step.
-    fn shown(&self, sent: &Sent) -> Vec<Seen> {
+    fn shown(&self, sent: &Sent) -> Vec<AgentObservation> {
         let (reply, payload) = answer(sent, PATIENCE).expect("an answer to a step");
         assert_eq!(reply.status, Status::Ok as u32, "{reply:?}");
         let parts = split_step_payload(&reply, &payload).expect("a whole payload");
@@ -98,7 +98,7 @@ fn path(k: u64, robot: u32) -> Vec<u8> {
 
 /// Flies four robots, with one client for each range of robots in `shares`, and returns the observations. The clients
 /// send their paths in another order in each step.
-fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
+fn send_paths(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<AgentObservation>> {
     let flyer = |robots: &Range<u32>| Flyer::new(server, robots.clone());
     let flyers: Vec<_> = shares.iter().map(flyer).collect();
     let step = |k: u64| {
@@ -124,8 +124,8 @@ fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
 fn bytes_do_not_depend_on_sender_or_order_of_paths() {
     let together = Server::start(&format!("{FLAGS} --threads 1"));
     let all = 0..4;
-    let expected = fly(&together, std::slice::from_ref(&all));
-    let has_shared = |step: &Vec<Seen>| {
+    let expected = send_paths(&together, std::slice::from_ref(&all));
+    let has_shared = |step: &Vec<AgentObservation>| {
         let own: u32 = step.iter().map(|(_, robot, _)| robot.n_visited).sum();
         own > step[0].0.n_visited
     };
@@ -152,11 +152,11 @@ fn bytes_do_not_depend_on_sender_or_order_of_paths() {
     let apart = Server::start(&format!("{FLAGS} --threads 2"));
     let (_folder, file) = new_file();
     let recorder = start_recorder(&apart.instance, &file, "");
-    assert!(fly(&apart, &[0..1, 1..2, 2..3, 3..4]) == expected);
+    assert!(send_paths(&apart, &[0..1, 1..2, 2..3, 3..4]) == expected);
     apart.info(); // answered only after the last step was published
     stop(recorder);
     let in_parts = Server::start(FLAGS);
-    assert!(fly(&in_parts, &[0..3, 3..4]) == expected);
+    assert!(send_paths(&in_parts, &[0..3, 3..4]) == expected);
 
     let mut mirror = Mirror::of(&apart.info());
     let steps = frames(&read_whole(&file));

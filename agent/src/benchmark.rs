@@ -1,6 +1,6 @@
 //! Benchmarks: runs policies on the same worlds, and scores them against the hidden states.
 
-pub(crate) mod arena;
 pub(crate) mod compare;
+pub(crate) mod compared_worlds;
 pub mod report;
-mod world_run;
+mod run_tally;

@@ -4,14 +4,14 @@
 //! server reveals is read only for decisions on a known-model belief. One request moves all robots by one step. The
 //! [`Learner`] determines what is learned, and how to act in the meantime.
 
-mod acting;
 pub mod metrics;
 pub mod seconds;
+mod shown_learner;
 mod spec;
 
 pub use self::spec::{CHECKPOINT, TrainingSpec};
 
-use self::acting::Acting;
+use self::shown_learner::ShownLearner;
 use crate::client::worlds::Worlds;
 use crate::training::metrics::{METRICS, Metrics, Tick};
 use crate::training::seconds::Stopwatch;
@@ -20,7 +20,7 @@ use emberwatch_acting::rollout;
 use emberwatch_acting::served::Served;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_learning::checkpoint::{self, Contents};
-use emberwatch_learning::learners::{self, Beginning, Learner, LearnerKind, ModelUpdate};
+use emberwatch_learning::learners::{self, Learner, LearnerInputs, LearnerKind, ModelUpdate};
 use emberwatch_protocol::client::{Backend, Claim, Client, Observation};
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::control::WorldSeed;
@@ -119,7 +119,7 @@ impl<'a> TrainingLoop<'a> {
         };
         let mut client = Client::acquire(worlds, &claim)?;
         let kind = spec.learner()?;
-        let mut learner = begin(spec, kind, &client, contents.as_ref())?;
+        let mut learner = new_learner(spec, kind, &client, contents.as_ref())?;
         let metrics = metrics(spec, kind, &*learner)?;
         let observations = first_observations(&mut client, spec)?;
         let seed = observations[0].world.seed;
@@ -134,10 +134,10 @@ impl<'a> TrainingLoop<'a> {
             tracing::info!(seed, "the first world");
         }
         for (robot, observation) in client.robots().zip(observations) {
-            let begun = learner.begin(robot, observation);
+            let begun = learner.start_episode(robot, observation);
             begun.map_err(|problem| spec.stopped(problem, &*learner))?;
         }
-        let belief = learner.rollout(0).agent.belief();
+        let belief = learner.agent(0).agent.belief();
         let feed = client.backend().feed(belief.probabilities());
         let now = Instant::now();
         Ok(Self {
@@ -183,16 +183,16 @@ impl<'a> TrainingLoop<'a> {
     fn step(&mut self) -> Result<Tick> {
         let shows_all = self.learner.wants_full_frames();
         let learner = &mut *self.learner;
-        let mut acting = Acting::new(learner, self.kind, &mut self.feed, &self.client);
+        let mut shown = ShownLearner::new(learner, self.kind, &mut self.feed, &self.client);
         let mut served = Served::new(&mut self.client, shows_all);
-        let records = rollout::step(&mut acting, &mut served)?.unwrap_or_default();
-        self.summary.planning += acting.planning;
+        let records = rollout::step(&mut shown, &mut served)?.unwrap_or_default();
+        self.summary.planning += shown.planning;
         let tick = Tick::of(&records, self.learner.world_steps());
         let robots = self.client.robots();
-        let present = (0..robots.len()).map(|index| self.learner.rollout(index).observation());
+        let present = (0..robots.len()).map(|index| self.learner.agent(index).observation());
         let over = ended(&self.client, present);
         for (robot, observation) in reset(&mut self.client, &over)? {
-            self.learner.begin(robot, observation)?;
+            self.learner.start_episode(robot, observation)?;
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
@@ -253,7 +253,7 @@ impl Reported {
 }
 
 /// Creates the learner of the client's robots. With `contents`, resumes it from a checkpoint.
-fn begin(
+fn new_learner(
     spec: &TrainingSpec,
     kind: &LearnerKind,
     client: &Client<impl Backend>,
@@ -266,7 +266,7 @@ fn begin(
         n_moves: info.n_moves,
         numbers: client.robots(),
     };
-    let learner = (kind.begin)(Beginning {
+    let learner = (kind.build)(LearnerInputs {
         worlds,
         info,
         config: &spec.config,
@@ -364,6 +364,6 @@ fn metrics(spec: &TrainingSpec, kind: &LearnerKind, learner: &dyn Learner) -> Re
     if spec.resume {
         Metrics::reopen(&path, columns, world_steps)
     } else {
-        Metrics::begin(&path, columns)
+        Metrics::create(&path, columns)
     }
 }

@@ -9,7 +9,7 @@ use emberwatch_acting::beliefs::{BeliefKind, Conditions, Input, Traits};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
 use emberwatch_acting::policy::{BEAM, Goal, Policy};
-use emberwatch_acting::rollout::{Rollout, building, step};
+use emberwatch_acting::rollout::{ActingAgent, building, step};
 use emberwatch_acting::served::Served;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::bayes::correct;
@@ -113,7 +113,7 @@ fn mean_reward(policy: &Policy, model: &Model) -> Result<f64> {
     for seen in Served::new(&mut client, false).observe()? {
         let seed = config.planner_seed(seen.observation.world.seed);
         let agent = building::agent(policy, &config, &conditions, n_moves, seed)?;
-        agents.push(Rollout::begun(agent, seen)?);
+        agents.push(ActingAgent::begun(agent, seen)?);
     }
     let mut sum = 0.0;
     for _ in 0..STEPS {

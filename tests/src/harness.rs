@@ -39,7 +39,7 @@ pub const SMALL: &str = "--height 5 --width 7 --moves 6 --burn-in 20";
 pub const ENDLESS: u64 = 1 << 40;
 
 /// The latest result of a world, and the result and frame of one of its robots.
-pub type Seen = (WorldResult, RobotResult, Vec<u8>);
+pub type AgentObservation = (WorldResult, RobotResult, Vec<u8>);
 
 pub struct Server {
     pub program: Program,
@@ -127,7 +127,7 @@ impl Server {
     }
 
     /// Observes a robot and its world over a connection without a lease.
-    pub fn observe(&self, robot: u32) -> Seen {
+    pub fn observe(&self, robot: u32) -> AgentObservation {
         let request = observe_header(robot..robot + 1);
         let answer = self.connect().step(request, &[], PATIENCE);
         let (reply, payload) = answer.expect("observe");
@@ -260,7 +260,7 @@ pub fn reset(client: &mut Client, first_seed: u64) {
 }
 
 /// Flies one path with a client's only robot.
-pub fn fly(client: &mut Client, path: Vec<Move>) -> Observation {
+pub fn send_paths(client: &mut Client, path: Vec<Move>) -> Observation {
     let robots = client.robots();
     client.step(robots, &[path]).expect("step").remove(0)
 }
@@ -270,7 +270,7 @@ pub fn fly_on(client: &mut Client, seed: u64, n_steps: usize) -> Vec<Observation
     let paths = Paths::new(seed)
         .take(client.info().n_moves, n_steps)
         .into_iter();
-    paths.map(|path| fly(client, path)).collect()
+    paths.map(|path| send_paths(client, path)).collect()
 }
 
 /// Returns the robots of a published step.
@@ -284,13 +284,13 @@ pub fn path_of(sample: &Sample<FrameHeader>) -> Vec<Move> {
 }
 
 /// Converts a published step with one robot to the form that [`Server::observe`] returns.
-pub fn seen_in(sample: &Sample<FrameHeader>) -> Seen {
+pub fn seen_in(sample: &Sample<FrameHeader>) -> AgentObservation {
     let robot = &robots_of(sample)[0];
     (sample.header.result, robot.result, robot.frame.to_vec())
 }
 
 /// Converts a client's observation to the form that [`Server::observe`] returns.
-pub fn seen_by(observation: &Observation) -> Seen {
+pub fn seen_by(observation: &Observation) -> AgentObservation {
     let frame = observation.frame.as_bytes().to_vec();
     (observation.world, observation.robot, frame)
 }

@@ -16,7 +16,7 @@ use emberwatch_model::{Cell, Frame, Model, Shape};
 use std::time::{Duration, Instant};
 
 /// The data that all worlds share: the model, the kind of belief with its learned values, and the planner's settings.
-pub struct Crew {
+pub struct OptionSetup {
     model: Model,
     shape: Shape,
     n_moves: usize,
@@ -26,7 +26,7 @@ pub struct Crew {
 }
 
 /// The belief about one world, and the plans of all options in it.
-pub struct Planned {
+pub struct OptionAgent {
     agent: Agent,
     /// In the order of [`emberwatch_belief::planning::OPTIONS`].
     proposals: Vec<Proposal>,
@@ -42,7 +42,7 @@ pub struct Shown {
     pub reward: Option<f64>,
 }
 
-impl Crew {
+impl OptionSetup {
     /// Creates the shared data. If `estimator` is `None`, the checkpoint's estimator is used, or [`RECOMMENDED`] if
     /// there is no checkpoint.
     ///
@@ -98,7 +98,7 @@ impl Crew {
     }
 
     /// Creates the belief about one world before its first frame. `prior` is the first belief of known-model filters.
-    pub fn begun(&self, prior: &Belief, world_seed: u64) -> Result<Planned> {
+    pub fn begun(&self, prior: &Belief, world_seed: u64) -> Result<OptionAgent> {
         let conditions = Conditions {
             shape: self.shape,
             model: Some(&self.model),
@@ -107,7 +107,7 @@ impl Crew {
         };
         let (policy, config) = (&self.policy, &self.config);
         let seed = config.planner_seed(world_seed);
-        Ok(Planned {
+        Ok(OptionAgent {
             agent: building::agent(policy, config, &conditions, self.n_moves, seed)?,
             proposals: Vec::new(),
             planning: Duration::ZERO,
@@ -127,7 +127,7 @@ pub fn usual(learned: &Learned) -> &'static BeliefKind {
     decided.or(found).unwrap_or(RECOMMENDED)
 }
 
-impl Planned {
+impl OptionAgent {
     /// Corrects the belief with a frame, and records the reward.
     pub fn see(&mut self, shown: &Shown) -> Result<()> {
         self.agent.correct(&shown.frame, None)?;

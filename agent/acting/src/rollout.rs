@@ -22,7 +22,7 @@ pub fn step(
     environment: &mut impl Environment,
 ) -> Result<Option<Vec<StepRecord>>> {
     let paths = actor.plan();
-    let Some(seen) = environment.fly(&paths)? else {
+    let Some(seen) = environment.step(&paths)? else {
         return Ok(None);
     };
     let records = actor.see(seen)?;
@@ -39,7 +39,7 @@ pub trait Actor {
     ///
     /// # Errors
     /// If a frame is impossible under a belief.
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>>;
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>>;
 
     /// Predicts all beliefs one step ahead.
     fn predict(&mut self);
@@ -51,19 +51,19 @@ pub trait Environment {
     ///
     /// # Errors
     /// If the environment cannot fly the paths.
-    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>>;
+    fn step(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<AgentObservation>>>;
 }
 
 /// An agent and its world's last observation. The agent plans for one robot, or for several robots that share one
 /// belief.
-pub struct Rollout {
+pub struct ActingAgent {
     pub agent: Agent,
-    seen: Seen,
+    seen: AgentObservation,
 }
 
 /// The observation that an agent receives.
 #[derive(Debug, Clone)]
-pub struct Seen {
+pub struct AgentObservation {
     /// Observation of the agent's first robot. Its frame corrects the belief.
     pub observation: Observation,
     /// Results of the agent's other robots.
@@ -83,7 +83,7 @@ pub struct StepRecord {
     pub score: Option<Score>,
 }
 
-impl Seen {
+impl AgentObservation {
     /// Combines the observations of an agent's robots in one world. There must be at least one observation.
     pub fn new(observations: impl IntoIterator<Item = Observation>) -> Self {
         let mut observations = observations.into_iter();
@@ -96,18 +96,18 @@ impl Seen {
     }
 }
 
-impl Rollout {
-    /// Creates a rollout, without correcting the agent's belief with the observation.
-    pub fn new(agent: Agent, seen: Seen) -> Self {
+impl ActingAgent {
+    /// Creates it without correcting the agent's belief with the observation.
+    pub fn new(agent: Agent, seen: AgentObservation) -> Self {
         Self { agent, seen }
     }
 
-    /// Creates a rollout, corrects the belief with the observation, and predicts it one step ahead.
-    pub fn begun(agent: Agent, seen: Seen) -> Result<Self> {
-        let mut rollout = Self::new(agent, seen);
-        rollout.correct()?;
-        rollout.agent.predict();
-        Ok(rollout)
+    /// Creates it, corrects the belief with the observation, and predicts it one step ahead.
+    pub fn begun(agent: Agent, seen: AgentObservation) -> Result<Self> {
+        let mut acting = Self::new(agent, seen);
+        acting.correct()?;
+        acting.agent.predict();
+        Ok(acting)
     }
 
     /// Plans the paths for step k -> k + 1, one for each robot.
@@ -117,7 +117,7 @@ impl Rollout {
     }
 
     /// Corrects the belief with the observation after a step. The belief is then the posterior.
-    pub fn see(&mut self, seen: Seen) -> Result<StepRecord> {
+    pub fn see(&mut self, seen: AgentObservation) -> Result<StepRecord> {
         let score = self.agent.score(&seen.observation.frame);
         let before = std::mem::replace(&mut self.seen, seen);
         self.correct()?;
@@ -130,7 +130,7 @@ impl Rollout {
 
     /// Corrects the belief with the stored observation, and records the reward. The belief is then the posterior.
     pub fn correct(&mut self) -> Result<()> {
-        let Seen {
+        let AgentObservation {
             observation, truth, ..
         } = &self.seen;
         self.agent.correct(&observation.frame, truth.as_ref())?;
@@ -167,13 +167,13 @@ impl Rollout {
 }
 
 /// Several agents, each with its own belief.
-impl Actor for Vec<Rollout> {
+impl Actor for Vec<ActingAgent> {
     fn plan(&mut self) -> Vec<Vec<Move>> {
-        let plans = in_parallel(self, Rollout::plan);
+        let plans = in_parallel(self, ActingAgent::plan);
         plans.into_iter().flatten().map(|plan| plan.moves).collect()
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
         see_all(self, seen)
     }
 
@@ -184,15 +184,15 @@ impl Actor for Vec<Rollout> {
 
 /// Corrects each agent's belief with its observation after the step. The beliefs are then posteriors.
 pub fn see_all<'a>(
-    rollouts: impl IntoIterator<Item = &'a mut Rollout>,
-    seen: Vec<Seen>,
+    agents: impl IntoIterator<Item = &'a mut ActingAgent>,
+    seen: Vec<AgentObservation>,
 ) -> Result<Vec<StepRecord>> {
-    let pairs = rollouts.into_iter().zip(seen);
-    let records = in_parallel(pairs, |(rollout, seen)| rollout.see(seen));
+    let pairs = agents.into_iter().zip(seen);
+    let records = in_parallel(pairs, |(acting, seen)| acting.see(seen));
     records.into_iter().collect()
 }
 
 /// Predicts all beliefs one step ahead.
-pub fn predict_all<'a>(rollouts: impl IntoIterator<Item = &'a mut Rollout>) {
-    Agent::predict_all(rollouts.into_iter().map(|rollout| &mut rollout.agent));
+pub fn predict_all<'a>(agents: impl IntoIterator<Item = &'a mut ActingAgent>) {
+    Agent::predict_all(agents.into_iter().map(|acting| &mut acting.agent));
 }

@@ -1,6 +1,6 @@
 //! The worlds of a client's robots, each with one agent, on a server or in this process.
 
-use crate::rollout::{Environment, Seen};
+use crate::rollout::{AgentObservation, Environment};
 use anyhow::Result;
 use emberwatch_messages::backend::Backend;
 use emberwatch_messages::client::Client;
@@ -23,15 +23,17 @@ impl<'a, B: Backend> Served<'a, B> {
     ///
     /// # Errors
     /// If the backend does not answer.
-    pub fn observe(&mut self) -> Result<Vec<Seen>> {
+    pub fn observe(&mut self) -> Result<Vec<AgentObservation>> {
         let observations = self.client.observe(self.client.robots())?;
         let seen = observations.into_iter();
-        Ok(seen.map(|observation| Seen::new([observation])).collect())
+        Ok(seen
+            .map(|observation| AgentObservation::new([observation]))
+            .collect())
     }
 }
 
 impl<B: Backend> Environment for Served<'_, B> {
-    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>> {
+    fn step(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<AgentObservation>>> {
         let robots = self.client.robots();
         let observations = if self.shows_all {
             self.client.step_full(robots, paths)?
@@ -41,7 +43,8 @@ impl<B: Backend> Environment for Served<'_, B> {
         // Hidden states are omitted: neither learners nor policies may see them.
         let seen = observations.into_iter();
         Ok(Some(
-            seen.map(|observation| Seen::new([observation])).collect(),
+            seen.map(|observation| AgentObservation::new([observation]))
+                .collect(),
         ))
     }
 }

@@ -6,7 +6,7 @@ use emberwatch_acting::learned::Learned;
 use emberwatch_acting::policy::Policy;
 use emberwatch_acting::rollout::agent::Agent;
 use emberwatch_acting::rollout::building::agent;
-use emberwatch_acting::rollout::{Actor, Rollout, Seen};
+use emberwatch_acting::rollout::{ActingAgent, Actor, AgentObservation};
 use emberwatch_belief::Belief;
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
@@ -18,7 +18,7 @@ fn shape() -> Shape {
 }
 
 /// The observations of robots at the given cells of a made-up world.
-fn seen(step: u64, cells: &[Cell]) -> Seen {
+fn seen(step: u64, cells: &[Cell]) -> AgentObservation {
     let mut frame = Frame::empty(shape());
     for cell in (0..72).filter(|cell| split_mix(step, *cell).is_multiple_of(4)) {
         frame.observe(cell as usize, (split_mix(step + 9, cell) % 3) as u8);
@@ -27,7 +27,7 @@ fn seen(step: u64, cells: &[Cell]) -> Seen {
         step,
         ..WorldResult::default()
     };
-    Seen::new(cells.iter().map(|cell| Observation {
+    AgentObservation::new(cells.iter().map(|cell| Observation {
         world,
         robot: RobotResult {
             row: cell.row as u32,
@@ -39,7 +39,7 @@ fn seen(step: u64, cells: &[Cell]) -> Seen {
 }
 
 /// An agent at the start of a made-up world, with robots at the given cells.
-fn robot(policy: &str, cells: &[Cell]) -> Rollout {
+fn robot(policy: &str, cells: &[Cell]) -> ActingAgent {
     let model = Model::wildfire();
     let conditions = Conditions {
         model: Some(&model),
@@ -49,7 +49,7 @@ fn robot(policy: &str, cells: &[Cell]) -> Rollout {
     };
     let policy = Policy::named(policy, &model).expect("known");
     let agent = agent(&policy, &AgentConfig::default(), &conditions, 6, 7);
-    Rollout::begun(agent.expect("an agent"), seen(0, cells)).expect("possible")
+    ActingAgent::begun(agent.expect("an agent"), seen(0, cells)).expect("possible")
 }
 
 const CELLS: [Cell; 3] = [
@@ -108,7 +108,7 @@ fn agents_together_act_as_each_agent_alone() {
     let (mut together, mut alone) = (new(), new());
     for step in 1..4 {
         let paths = together.plan();
-        let of_each = alone.iter_mut().flat_map(Rollout::plan);
+        let of_each = alone.iter_mut().flat_map(ActingAgent::plan);
         assert_eq!(paths, of_each.map(|plan| plan.moves).collect::<Vec<_>>());
         let sights = || [seen(step, &CELLS[..2]), seen(step + 50, &CELLS[2..])];
         together.see(sights().into()).expect("possible");

@@ -102,7 +102,7 @@ impl Recursion {
         })
     }
 
-    fn begin(&mut self, start: Option<&[f32]>) {
+    fn reset(&mut self, start: Option<&[f32]>) {
         let layout = self.operator.layout;
         let first = || self.tables.prior(layout.shape).as_slice().to_vec();
         let belief = start.map_or_else(first, <[f32]>::to_vec);
@@ -248,7 +248,7 @@ impl WithSimd for Pass<'_> {
             log_likelihood: 0.0,
             n_seen: 0,
         };
-        recursion.begin(self.start);
+        recursion.reset(self.start);
         for (frame, sightings) in self.frames.iter().enumerate() {
             outcome.log_likelihood += recursion.correct(frame, sightings);
             outcome.n_seen += sightings.len();

@@ -29,7 +29,7 @@ fn parameters() -> Parameters {
 /// A replay buffer with frames of random walks, or of straight flights, in a made-up world.
 fn replay(is_straight: bool) -> BlockReplay {
     let mut replay = BlockReplay::new(64, 64 * 64);
-    replay.begin(0);
+    replay.start_track(0);
     let mut robot = shape().centre();
     for step in 0..64 * 64 {
         let direction = |t: u64| split_mix(step, if is_straight { 0 } else { t }) >> 62;

@@ -12,7 +12,7 @@ pub mod neural;
 pub(crate) mod tests;
 mod update;
 
-pub use self::base::{Beginning, Learner, LearnerKind, Worlds};
+pub use self::base::{Learner, LearnerInputs, LearnerKind, Worlds};
 pub use self::update::ModelUpdate;
 
 use crate::checkpoint::{self, Contents};

@@ -43,7 +43,7 @@ impl BlockReplay {
     }
 
     /// Begins a new track for a robot, and ends the robot's previous track.
-    pub fn begin(&mut self, robot: u32) {
+    pub fn start_track(&mut self, robot: u32) {
         let block = self.new_block(None);
         if let Some((number, last)) = self.open.insert(robot, block)
             && !last.frames.is_empty()
@@ -147,8 +147,8 @@ mod tests {
     /// A buffer for 3 blocks of 2 frames, with frames of two robots in alternation.
     fn replay(n_frames: u8) -> BlockReplay {
         let mut replay = BlockReplay::new(2, 7);
-        replay.begin(0);
-        replay.begin(5);
+        replay.start_track(0);
+        replay.start_track(5);
         (0..n_frames).for_each(|value| see(&mut replay, value));
         replay
     }
@@ -175,7 +175,7 @@ mod tests {
         assert_eq!(numbers(&replay(6)), [3, 4, 5]);
         let mut short = BlockReplay::new(2, 7);
         for _ in 0..9 {
-            short.begin(0);
+            short.start_track(0);
             short.push(0, &frame(1), None);
         }
         assert_eq!(numbers(&short), [1, 2, 3, 4, 5, 6, 7]);
@@ -198,7 +198,7 @@ mod tests {
     #[test]
     fn a_track_ends_with_a_shorter_block() {
         let mut replay = replay(3);
-        replay.begin(0);
+        replay.start_track(0);
         replay.push(0, &frame(7), Some(&belief(7)));
         replay.push(0, &frame(8), None);
         let kept = replay.blocks().map(|number| {
@@ -214,8 +214,8 @@ mod tests {
         ];
         assert_eq!(kept.collect::<Vec<_>>(), expected);
         replay.hand_on(2, &[8.0]); // There is no next block.
-        replay.begin(0);
-        replay.begin(0);
+        replay.start_track(0);
+        replay.start_track(0);
         assert_eq!(replay.blocks().last(), Some(4), "no block without frames");
     }
 }

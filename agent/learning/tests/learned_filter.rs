@@ -96,7 +96,7 @@ fn replay(n_frames: u64) -> BlockReplay {
     let shape = shape(10, 12);
     let mut replay = BlockReplay::new(8, 1000);
     for world in 0..2 {
-        replay.begin(world);
+        replay.start_track(world);
         for number in 0..n_frames {
             let frame = frame(shape, 3, number * 2 + u64::from(world));
             replay.push(world, &frame, Some(&belief(3, shape, number)));

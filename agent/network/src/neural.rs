@@ -39,7 +39,7 @@ const PASS_CELLS: usize = 262_144;
 
 /// The sightings of a world, and, if the network corrects the predictions of a filter, the filter's prediction,
 /// `[O, H, W]`.
-pub type Seen<'a> = (&'a Sightings, Option<&'a Probabilities>);
+pub type AgentObservation<'a> = (&'a Sightings, Option<&'a Probabilities>);
 
 /// The network, its variables and its optimiser. Clones share the variables, so an update of one clone changes all.
 #[derive(Clone)]
@@ -148,7 +148,10 @@ impl NeuralBelief {
     ///
     /// # Errors
     /// The same as for [`Self::predict`].
-    pub fn predict_all(&self, worlds: &[Seen<'_>]) -> Result<Vec<Probabilities>, NetworkError> {
+    pub fn predict_all(
+        &self,
+        worlds: &[AgentObservation<'_>],
+    ) -> Result<Vec<Probabilities>, NetworkError> {
         let Some((first, _)) = worlds.first() else {
             return Ok(Vec::new());
         };
@@ -175,7 +178,10 @@ impl NeuralBelief {
         Ok(passes?.into_iter().flatten().collect())
     }
 
-    fn predict_in_one_pass(&self, worlds: &[Seen<'_>]) -> Result<Vec<Probabilities>, NetworkError> {
+    fn predict_in_one_pass(
+        &self,
+        worlds: &[AgentObservation<'_>],
+    ) -> Result<Vec<Probabilities>, NetworkError> {
         let (n, shape) = (worlds.len(), worlds[0].0.shape());
         let (crop, (height, width)) = (Crop::whole(shape), shape.dim());
         let images = worlds.iter().map(|(sightings, _)| (*sightings, &crop));

@@ -30,7 +30,7 @@ impl FrameReplay {
     }
 
     /// Starts a new track. No window spans frames of two tracks.
-    pub fn begin(&mut self) {
+    pub fn start_track(&mut self) {
         self.begins.push_back(self.n_pushed);
     }
 
@@ -114,10 +114,10 @@ mod tests {
     fn no_window_spans_two_tracks() {
         let mut replay = FrameReplay::new(10);
         let frame = Frame::empty(Shape::new(4, 5).expect("valid shape"));
-        replay.begin();
+        replay.start_track();
         for number in 0..30 {
             if [7, 21, 25, 26].contains(&number) {
-                replay.begin();
+                replay.start_track();
             }
             replay.push(frame.clone());
         }

@@ -4,7 +4,7 @@
 use crate::client::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
 use emberwatch_acting::beliefs::Input;
-use emberwatch_acting::rollout::{Rollout, Seen};
+use emberwatch_acting::rollout::{ActingAgent, AgentObservation};
 use emberwatch_protocol::Client;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::message::Status;
@@ -15,12 +15,12 @@ const RENEW_AFTER: u64 = 500;
 /// Restores an agent's belief from the belief or the frames that the server keeps. Returns true if the belief already
 /// includes the present frame, so that it describes X_{k+1}. `number` is the server's number of the agent's first
 /// robot.
-pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result<bool> {
-    if take_over_left(client, number, rollout)? {
+pub fn resume(client: &mut Client, number: u32, acting: &mut ActingAgent) -> Result<bool> {
+    if take_over_left(client, number, acting)? {
         return Ok(true);
     }
-    let step = rollout.step();
-    if rollout.agent.policy().belief.input != Input::Frames {
+    let step = acting.step();
+    if acting.agent.policy().belief.input != Input::Frames {
         return Ok(false);
     }
     let first = first_kept(client, number, step)?;
@@ -28,7 +28,7 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
         if (past - first) % RENEW_AFTER == 0 {
             client.renew()?; // Recalling does not renew the lease.
         }
-        if !recall(client, number, rollout, past)? {
+        if !recall(client, number, acting, past)? {
             client.renew()?; // Fails if another client has taken the robot.
             break;
         }
@@ -46,29 +46,34 @@ pub fn resume(client: &mut Client, number: u32, rollout: &mut Rollout) -> Result
 
 /// Updates the belief of an agent that missed steps with the missed frames and the present frame. The belief is then
 /// the posterior.
-pub fn catch_up(client: &mut Client, number: u32, rollout: &mut Rollout, seen: Seen) -> Result<()> {
-    let missed = rollout.step() + 1..seen.observation.world.step;
-    if rollout.agent.policy().belief.input == Input::Frames {
+pub fn catch_up(
+    client: &mut Client,
+    number: u32,
+    acting: &mut ActingAgent,
+    seen: AgentObservation,
+) -> Result<()> {
+    let missed = acting.step() + 1..seen.observation.world.step;
+    if acting.agent.policy().belief.input == Input::Frames {
         for past in missed {
-            if !recall(client, number, rollout, past)? {
-                rollout.agent.predict(); // The server has not kept the step's frame.
+            if !recall(client, number, acting, past)? {
+                acting.agent.predict(); // The server has not kept the step's frame.
             }
         }
     }
-    rollout.see(seen)?;
+    acting.see(seen)?;
     Ok(())
 }
 
 /// Updates an agent's belief with the frame of an earlier step. Returns false if the server has not kept the frame.
-fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) -> Result<bool> {
+fn recall(client: &mut Client, number: u32, acting: &mut ActingAgent, step: u64) -> Result<bool> {
     let Ok(seen) = client.recall(number..number + 1, step) else {
         return Ok(false);
     };
-    rollout.agent.correct(&seen[0].frame, None)?;
+    acting.agent.correct(&seen[0].frame, None)?;
     if step > 0 {
-        rollout.agent.earn(seen[0].robot.reward);
+        acting.agent.earn(seen[0].robot.reward);
     }
-    rollout.agent.predict();
+    acting.agent.predict();
     Ok(true)
 }
 
@@ -76,16 +81,16 @@ fn recall(client: &mut Client, number: u32, rollout: &mut Rollout, step: u64) ->
 pub fn take_over_left(
     client: &mut Client,
     number: u32,
-    rollout: &mut Rollout,
+    acting: &mut ActingAgent,
 ) -> Result<bool, ConnectionError> {
-    let step = rollout.step();
-    let Some(kind) = rollout.agent.handover_kind() else {
+    let step = acting.step();
+    let Some(kind) = acting.agent.handover_kind() else {
         return Ok(false);
     };
     let Some(left) = left_belief(client, number, &kind)? else {
         return Ok(false);
     };
-    let is_taken = rollout.agent.take_over(&left);
+    let is_taken = acting.agent.take_over(&left);
     if is_taken {
         tracing::info!(
             robot = number,
@@ -98,9 +103,13 @@ pub fn take_over_left(
 
 /// Leaves an agent's belief for the robot's next agent. The belief is a prediction of X_{k+1} that includes the last
 /// observation.
-pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), ConnectionError> {
-    let present = rollout.observation().world;
-    let agent = &rollout.agent;
+pub fn leave(
+    client: &mut Client,
+    number: u32,
+    acting: &ActingAgent,
+) -> Result<(), ConnectionError> {
+    let present = acting.observation().world;
+    let agent = &acting.agent;
     let Some((kind, bytes)) = agent.handover_kind().zip(agent.handover()) else {
         return Ok(());
     };

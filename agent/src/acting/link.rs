@@ -3,7 +3,7 @@
 use crate::acting::mission::Mission;
 use crate::client::truth::TruthFeed;
 use anyhow::Result;
-use emberwatch_acting::rollout::{Environment, Seen};
+use emberwatch_acting::rollout::{AgentObservation, Environment};
 use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::{Client, Move};
 use std::ops::Range;
@@ -38,13 +38,13 @@ impl Link {
     }
 
     /// Returns what the agent sees of the world's present state.
-    pub fn observe(&mut self) -> Result<Seen> {
+    pub fn observe(&mut self) -> Result<AgentObservation> {
         let observations = self.client.observe(self.robots.clone())?;
         self.with_truth(observations)
     }
 
-    fn with_truth(&self, observations: Vec<Observation>) -> Result<Seen> {
-        let mut seen = Seen::new(observations);
+    fn with_truth(&self, observations: Vec<Observation>) -> Result<AgentObservation> {
+        let mut seen = AgentObservation::new(observations);
         if let Some(feed) = &self.truth {
             let worlds = self.client.worlds_of(&self.client.robots());
             let world = &seen.observation.world;
@@ -56,7 +56,7 @@ impl Link {
 }
 
 impl Environment for Link {
-    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>> {
+    fn step(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<AgentObservation>>> {
         let Self {
             client,
             robots,

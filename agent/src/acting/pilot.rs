@@ -12,7 +12,9 @@ use emberwatch_acting::beliefs::first_belief::first_belief;
 use emberwatch_acting::beliefs::{Conditions, Input, WorldForm};
 use emberwatch_acting::policy::Policy;
 use emberwatch_acting::rollout::agent::Agent;
-use emberwatch_acting::rollout::{self, Actor, Rollout, Seen, StepRecord, building};
+use emberwatch_acting::rollout::{
+    self, ActingAgent, Actor, AgentObservation, StepRecord, building,
+};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;
@@ -40,7 +42,7 @@ pub struct Pilot {
 /// The agent, and the feed on which its belief is published.
 struct Flyer {
     /// Plans for the agent's own robots and, in a team, for the other robots.
-    rollout: Rollout,
+    acting: ActingAgent,
     /// Numbers on the server of all robots that the agent plans for.
     robots: Range<u32>,
     /// Numbers on the server of the robots that it flies.
@@ -80,9 +82,9 @@ impl Pilot {
         let prior = prior(mission, &info, &model, &policy)?;
         let mut attached = Self::acquire(mission, &numbers, (&model, &policy, &prior))?;
         attached.prior = Some(prior);
-        let (client, rollout) = (&mut attached.link.client, &mut attached.flyer.rollout);
-        if !resume(client, numbers.start, rollout)? {
-            attached.begin()?;
+        let (client, acting) = (&mut attached.link.client, &mut attached.flyer.acting);
+        if !resume(client, numbers.start, acting)? {
+            attached.start_episode()?;
         }
         Ok(attached)
     }
@@ -95,8 +97,8 @@ impl Pilot {
         parts: (&Model, &Policy, &Belief),
     ) -> Result<Option<Self>> {
         let mut attached = Self::acquire(mission, numbers, parts)?;
-        let (client, rollout) = (&mut attached.link.client, &mut attached.flyer.rollout);
-        if take_over_left(client, numbers.start, rollout)? {
+        let (client, acting) = (&mut attached.link.client, &mut attached.flyer.acting);
+        if take_over_left(client, numbers.start, acting)? {
             return Ok(Some(attached));
         }
         // Another agent has acted since the belief was found.
@@ -138,7 +140,7 @@ impl Pilot {
         )?;
         let flyer = Flyer {
             feed: Feed::open(&mission.instance, agent.belief().probabilities()),
-            rollout: Rollout::new(agent, seen),
+            acting: ActingAgent::new(agent, seen),
             robots,
             own: link.client.robots(),
             team,
@@ -155,14 +157,14 @@ impl Pilot {
         })
     }
 
-    fn begin(&mut self) -> Result<()> {
-        self.flyer.rollout.correct()?;
+    fn start_episode(&mut self) -> Result<()> {
+        self.flyer.acting.correct()?;
         self.flyer.show();
-        self.flyer.rollout.agent.predict();
+        self.flyer.acting.agent.predict();
         Ok(())
     }
 
-    fn begin_next(&mut self, mission: &Mission) -> Result<()> {
+    fn start_next_episode(&mut self, mission: &Mission) -> Result<()> {
         let prior = match self.prior.take() {
             Some(prior) => prior,
             None => prior(mission, self.link.client.info(), &self.model, &self.policy)?,
@@ -179,17 +181,17 @@ impl Pilot {
         let first = self.flyer.robots.start % self.flyer.team;
         let parts = (&self.model, &self.policy, &prior);
         let agent = agent(mission, self.link.client.info(), parts, (seed, first))?;
-        self.flyer.rollout = Rollout::new(agent, seen);
+        self.flyer.acting = ActingAgent::new(agent, seen);
         self.prior = Some(prior);
-        self.begin()
+        self.start_episode()
     }
 
     /// Flies one step, in the next episode if the last one has ended. Returns the reward. Returns `None` if no path was
     /// flown, either because the agent must stop, or because the world stepped without the agent, which then catches up.
     /// The belief after the last step is always published.
     pub fn step(&mut self, mission: &Mission, is_last: bool) -> Result<Option<f64>> {
-        if self.flyer.rollout.observation().world.truncated != 0 {
-            self.begin_next(mission)?;
+        if self.flyer.acting.observation().world.truncated != 0 {
+            self.start_next_episode(mission)?;
         }
         self.flyer.is_last = is_last;
         match rollout::step(&mut self.flyer, &mut self.link) {
@@ -202,7 +204,7 @@ impl Pilot {
     /// Leaves the belief for the next agent of each robot.
     pub fn leave(&mut self) -> Result<(), ConnectionError> {
         let mut numbers = self.flyer.own.clone();
-        numbers.try_for_each(|number| leave(&mut self.link.client, number, &self.flyer.rollout))
+        numbers.try_for_each(|number| leave(&mut self.link.client, number, &self.flyer.acting))
     }
 
     /// Releases the robots. Returns only after observers have had time to see the last belief.
@@ -214,18 +216,18 @@ impl Pilot {
 
     /// Updates the belief after steps that the world made without the agent.
     fn catch_up(&mut self) -> Result<()> {
-        let before = self.flyer.rollout.step();
+        let before = self.flyer.acting.step();
         let seen = self.link.observe()?;
         let step = seen.observation.world.step;
         if self.warned.is_none_or(|at| at.elapsed() > WARN_INTERVAL) {
             self.warned = Some(Instant::now());
             tracing::warn!("late: the world advanced from step {before} to {step}; catching up");
         }
-        let (client, rollout) = (&mut self.link.client, &mut self.flyer.rollout);
-        catch_up(client, self.flyer.robots.start, rollout, seen)?;
+        let (client, acting) = (&mut self.link.client, &mut self.flyer.acting);
+        catch_up(client, self.flyer.robots.start, acting, seen)?;
         self.flyer.is_last = false;
         self.flyer.show();
-        self.flyer.rollout.agent.predict();
+        self.flyer.acting.agent.predict();
         Ok(())
     }
 }
@@ -235,10 +237,10 @@ impl Actor for Flyer {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         let is_planned = self.is_planned();
-        let cells = self.rollout.cells().into_iter().zip(&is_planned);
+        let cells = self.acting.cells().into_iter().zip(&is_planned);
         let cells: Vec<Cell> = cells.filter(|(_, is)| **is).map(|(cell, _)| cell).collect();
-        let step = self.rollout.step();
-        let plans = self.rollout.agent.plan(&cells, step);
+        let step = self.acting.step();
+        let plans = self.acting.agent.plan(&cells, step);
         self.planning = start.elapsed();
         let own = self.own_indices();
         let n_before = is_planned[..own.start].iter().filter(|it| **it).count();
@@ -246,15 +248,15 @@ impl Actor for Flyer {
         own.map(|plan| plan.moves).collect()
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
-        let seen = seen.into_iter().map(|seen| self.rollout.see(seen));
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
+        let seen = seen.into_iter().map(|seen| self.acting.see(seen));
         let records = seen.collect::<Result<_>>()?;
         self.show();
         Ok(records)
     }
 
     fn predict(&mut self) {
-        self.rollout.agent.predict();
+        self.acting.agent.predict();
     }
 }
 
@@ -263,7 +265,7 @@ impl Flyer {
     fn show(&mut self) {
         if self.feed.is_due() || self.is_last {
             let world = self.own.start / self.team;
-            let view = view(&self.rollout, world, self.own.clone(), self.planning);
+            let view = view(&self.acting, world, self.own.clone(), self.planning);
             self.feed.show(&view);
         }
     }
@@ -271,7 +273,7 @@ impl Flyer {
     /// Returns the last step's reward, summed over the agent's robots.
     fn reward(&self) -> f64 {
         let own = self.own_indices();
-        let results = self.rollout.results().skip(own.start).take(own.len());
+        let results = self.acting.results().skip(own.start).take(own.len());
         results.map(|result| result.reward).sum()
     }
 
@@ -284,7 +286,7 @@ impl Flyer {
     /// Returns, for each robot, whether to plan for it: true for the agent's robots and for other robots that flew.
     fn is_planned(&self) -> Vec<bool> {
         let (own, team) = (self.own_indices(), self.team);
-        let hovered = self.rollout.observation().world.hovered;
+        let hovered = self.acting.observation().world.hovered;
         let is_planned = |(index, number): (usize, u32)| {
             own.contains(&index) || hovered >> (number % team) & 1 == 0
         };

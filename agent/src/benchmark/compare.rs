@@ -1,10 +1,10 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
 use crate::acting::team::Team;
-use crate::benchmark::arena::Arena;
+use crate::benchmark::compared_worlds::ComparedWorlds;
 use crate::benchmark::report::PolicyRun;
 use crate::benchmark::report::common_worlds::World;
-use crate::benchmark::world_run::WorldRun;
+use crate::benchmark::run_tally::RunTally;
 use crate::client::view::view;
 use anyhow::{Context, Result, ensure};
 use emberwatch_acting::beliefs::first_belief::first_belief;
@@ -14,7 +14,7 @@ use emberwatch_acting::learned::Learned;
 use emberwatch_acting::parallel::in_parallel;
 use emberwatch_acting::policy::Policy;
 use emberwatch_acting::rollout::{
-    self, Actor, Rollout, Seen, StepRecord, building, predict_all, see_all,
+    self, ActingAgent, Actor, AgentObservation, StepRecord, building, predict_all, see_all,
 };
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Plan;
@@ -52,39 +52,39 @@ pub struct Results {
 
 /// Runs every policy on every world. Calls `progress` with a policy's name and the number of world steps just made.
 pub fn compare(
-    arena: &mut Arena,
+    worlds: &mut ComparedWorlds,
     comparison: &Comparison,
     progress: &mut dyn FnMut(&str, u64),
 ) -> Result<Results> {
     let config = &comparison.config;
-    let prior = config.prior(arena.info().burn_in);
-    let prior = first_belief(prior, arena.known_model(), arena.shape(), config.seed)?;
+    let prior = config.prior(worlds.info().burn_in);
+    let prior = first_belief(prior, worlds.known_model(), worlds.shape(), config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     let mut results = Results::default();
-    let mut feed = arena.feed(prior.probabilities());
-    let contestants = comparison.contestants(&arena.model);
+    let mut feed = worlds.feed(prior.probabilities());
+    let entries = comparison.entries(&worlds.model);
     // Before other policies run for hours, refuse any policy that cannot run.
-    for (policy, _) in &contestants {
-        let checked = comparison.check(policy, arena);
+    for (policy, _) in &entries {
+        let checked = comparison.check(policy, worlds);
         checked.with_context(|| format!("policy {:?}", policy.name))?;
     }
-    for (index, (policy, team)) in contestants.iter().enumerate() {
-        arena.fly_as(*team);
-        for batch in seeds.chunks(arena.n_worlds as usize) {
-            let started = comparison.start(policy, &prior, arena, batch, &mut feed);
-            let played = started.and_then(|mut players| {
+    for (index, (policy, team)) in entries.iter().enumerate() {
+        worlds.set_team(*team);
+        for batch in seeds.chunks(worlds.n_worlds as usize) {
+            let started = comparison.start(policy, &prior, worlds, batch, &mut feed);
+            let played = started.and_then(|mut agents| {
                 for _ in 0..comparison.steps {
-                    rollout::step(&mut players, arena)?;
+                    rollout::step(&mut agents, worlds)?;
                     progress(&policy.name, batch.len() as u64);
                 }
-                Ok(players.worlds)
+                Ok(agents.tallies)
             });
-            let worlds = played.with_context(|| format!("policy {:?}", policy.name))?;
+            let tallies = played.with_context(|| format!("policy {:?}", policy.name))?;
             if index == 0 {
-                results.add_fire(1.0 / seeds.len() as f32, &worlds);
+                results.add_fire(1.0 / seeds.len() as f32, &tallies);
             }
-            let runs = worlds.into_iter();
-            let runs = runs.map(|world| world.into_run(policy, *team, arena.info()));
+            let runs = tallies.into_iter();
+            let runs = runs.map(|tally| tally.into_run(policy, *team, worlds.info()));
             results.runs.extend(runs);
         }
     }
@@ -100,27 +100,27 @@ impl Comparison {
     }
 
     /// Returns each policy with each kind of team, but the oracle team only once.
-    pub fn contestants(&self, model: &Model) -> Vec<(Policy, Team)> {
-        let mut contestants = Vec::new();
+    pub fn entries(&self, model: &Model) -> Vec<(Policy, Team)> {
+        let mut entries = Vec::new();
         for &team in &self.teams {
             let oracle = Policy::named(ORACLE, model).expect("invariant: every model has it");
             match team {
-                Team::Oracle => contestants.push((oracle, team)),
-                _ => contestants.extend(self.policies.iter().map(|it| (it.clone(), team))),
+                Team::Oracle => entries.push((oracle, team)),
+                _ => entries.extend(self.policies.iter().map(|it| (it.clone(), team))),
             }
         }
-        contestants
+        entries
     }
 
-    /// Checks that a policy can act in an arena.
-    fn check(&self, policy: &Policy, arena: &mut Arena) -> Result<()> {
+    /// Checks that a policy can act in the worlds.
+    fn check(&self, policy: &Policy, worlds: &mut ComparedWorlds) -> Result<()> {
         let needs_truth = policy.belief.input == Input::States || self.first_state_known;
         ensure!(
-            arena.has_truth() || !needs_truth,
+            worlds.has_truth() || !needs_truth,
             "it needs the truth channel: start the server with --publish-truth"
         );
-        arena.check_model(policy)?;
-        let world = WorldForm::of(&arena.model, arena.shape());
+        worlds.check_model(policy)?;
+        let world = WorldForm::of(&worlds.model, worlds.shape());
         building::check(policy, &self.learned, &world)
     }
 
@@ -129,36 +129,36 @@ impl Comparison {
         &self,
         policy: &Policy,
         prior: &Belief,
-        arena: &mut Arena,
+        worlds: &mut ComparedWorlds,
         seeds: &[u64],
         feed: &'a mut Feed,
-    ) -> Result<Players<'a>> {
-        let seen = arena.reset(seeds)?;
-        let n_agents = arena.n_agents();
-        let mut rollouts = Vec::new();
+    ) -> Result<MeasuredAgents<'a>> {
+        let seen = worlds.reset(seeds)?;
+        let n_agents = worlds.n_agents();
+        let mut agents = Vec::new();
         for (index, seen) in seen.into_iter().enumerate() {
             let (seed, number) = (seeds[index / n_agents], index % n_agents);
             // If the first state is known, the belief is certain.
             let known = seen.truth.as_ref().filter(|_| self.first_state_known);
-            let n_states = arena.known_model().n_states();
+            let n_states = worlds.known_model().n_states();
             let certain = known.map(|states| Belief::from_states(states, n_states));
             let certain = certain.transpose()?;
             let conditions = Conditions {
-                model: Some(arena.known_model()),
-                shape: arena.shape(),
+                model: Some(worlds.known_model()),
+                shape: worlds.shape(),
                 prior: Some(certain.as_ref().unwrap_or(prior)),
                 learned: &self.learned,
             };
             let seed = robot_seed(self.config.planner_seed(seed), number);
-            let n_moves = arena.info().n_moves;
+            let n_moves = worlds.info().n_moves;
             let agent = building::agent(policy, &self.config, &conditions, n_moves, seed)?;
-            rollouts.push(Rollout::begun(agent, seen)?);
+            agents.push(ActingAgent::begun(agent, seen)?);
         }
-        let (target, n_robots) = (arena.model.target_state(), arena.n_robots());
-        let world = |&seed| WorldRun::new(seed, arena.shape(), target);
-        Ok(Players {
-            rollouts,
-            worlds: seeds.iter().map(world).collect(),
+        let (target, n_robots) = (worlds.model.target_state(), worlds.n_robots());
+        let tally = |&seed| RunTally::new(seed, worlds.shape(), target);
+        Ok(MeasuredAgents {
+            agents,
+            tallies: seeds.iter().map(tally).collect(),
             plans: Vec::new(),
             n_robots,
             feed,
@@ -167,8 +167,8 @@ impl Comparison {
 }
 
 impl Results {
-    fn add_fire(&mut self, share: f32, worlds: &[WorldRun]) {
-        for cells in worlds.iter().map(|world| &world.fire_cells) {
+    fn add_fire(&mut self, share: f32, tallies: &[RunTally]) {
+        for cells in tallies.iter().map(|tally| &tally.fire_cells) {
             self.fire_cells.resize(cells.len(), 0.0);
             let both = self.fire_cells.iter_mut().zip(cells);
             both.for_each(|(mean, cells)| *mean += share * cells);
@@ -177,10 +177,10 @@ impl Results {
 }
 
 /// The agents of a batch of worlds, and the measurements of each world.
-struct Players<'a> {
-    /// One rollout per agent, ordered by world.
-    rollouts: Vec<Rollout>,
-    worlds: Vec<WorldRun>,
+struct MeasuredAgents<'a> {
+    /// Ordered by world.
+    agents: Vec<ActingAgent>,
+    tallies: Vec<RunTally>,
     /// Each agent's last plans, and the time that planning took.
     plans: Vec<(Vec<Plan>, Duration)>,
     /// Number of robots per world.
@@ -188,25 +188,25 @@ struct Players<'a> {
     feed: &'a mut Feed,
 }
 
-impl Actor for Players<'_> {
+impl Actor for MeasuredAgents<'_> {
     fn plan(&mut self) -> Vec<Vec<Move>> {
-        self.plans = in_parallel(&mut self.rollouts, |rollout| {
+        self.plans = in_parallel(&mut self.agents, |acting| {
             let start = Instant::now();
-            (rollout.plan(), start.elapsed())
+            (acting.plan(), start.elapsed())
         });
         let plans = self.plans.iter().flat_map(|(plans, _)| plans);
         plans.map(|plan| plan.moves.clone()).collect()
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
-        let records = see_all(&mut self.rollouts, seen)?;
-        let n_agents = self.rollouts.len() / self.worlds.len();
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
+        let records = see_all(&mut self.agents, seen)?;
+        let n_agents = self.agents.len() / self.tallies.len();
         for (index, record) in records.iter().enumerate() {
-            let (world, rollout) = (&mut self.worlds[index / n_agents], &self.rollouts[index]);
+            let (tally, acting) = (&mut self.tallies[index / n_agents], &self.agents[index]);
             let (plans, time) = &self.plans[index];
-            world.count(rollout, plans, *time, self.n_robots);
+            tally.count(acting, plans, *time, self.n_robots);
             if index % n_agents == 0 {
-                world.score(rollout, record.score);
+                tally.score(acting, record.score);
             }
         }
         self.show(n_agents);
@@ -214,19 +214,19 @@ impl Actor for Players<'_> {
     }
 
     fn predict(&mut self) {
-        predict_all(&mut self.rollouts);
+        predict_all(&mut self.agents);
     }
 }
 
-impl Players<'_> {
+impl MeasuredAgents<'_> {
     /// Publishes the posterior of each agent that is due to be shown to observers.
     fn show(&mut self, n_agents: usize) {
-        let crew = (self.n_robots / n_agents) as u32;
-        for index in self.feed.due(self.rollouts.len()) {
-            let (world, robot) = ((index / n_agents) as u32, index as u32 * crew);
-            let (rollout, (_, time)) = (&self.rollouts[index], &self.plans[index]);
+        let n_own = (self.n_robots / n_agents) as u32;
+        for index in self.feed.due(self.agents.len()) {
+            let (world, robot) = ((index / n_agents) as u32, index as u32 * n_own);
+            let (acting, (_, time)) = (&self.agents[index], &self.plans[index]);
             self.feed
-                .show(&view(rollout, world, robot..robot + crew, *time));
+                .show(&view(acting, world, robot..robot + n_own, *time));
         }
     }
 }

@@ -1,8 +1,8 @@
 //! The ladder chart: one bar per row, with an error bar and one dot per world.
 
 use super::page::{
-    Area, GRID, HEAD, INK, LABEL, MARGIN, MUTED, NOTE, WIDTH, begin, covering, darker, finish, fit,
-    is_drawable, style, tick, width,
+    Area, GRID, HEAD, INK, LABEL, MARGIN, MUTED, NOTE, WIDTH, covering, darker, finish, fit,
+    is_drawable, style, tick, titled, width,
 };
 use anyhow::Result;
 use plotters::coord::combinators::{BindKeyPoints, WithKeyPoints};
@@ -54,7 +54,7 @@ impl Ladder {
     pub fn svg(&self) -> Result<String> {
         let height = TOP + ROW * self.bars.len() as i32 + FOOT;
         let mut svg = String::new();
-        self.draw(&begin(&mut svg, height, &self.title, &self.note)?)?;
+        self.draw(&titled(&mut svg, height, &self.title, &self.note)?)?;
         Ok(finish(&svg, height))
     }
 

@@ -1,8 +1,8 @@
 //! Panels of curves over a common axis, with error bands, and names at the ends of the curves.
 
 use super::page::{
-    Area, GRID, HEAD, INK, LABEL, MARGIN, MAX_VALUE, MUTED, NOTE, WIDTH, begin, covering, darker,
-    finish, fit, is_drawable, style, tick, width,
+    Area, GRID, HEAD, INK, LABEL, MARGIN, MAX_VALUE, MUTED, NOTE, WIDTH, covering, darker, finish,
+    fit, is_drawable, style, tick, titled, width,
 };
 use anyhow::{Result, ensure};
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
@@ -115,7 +115,7 @@ impl Lines {
         let of_panel = if panels.len() == 1 { ONLY_PANEL } else { PANEL };
         let height = HEAD + of_panel * panels.len() as i32 + FOOT;
         let mut svg = String::new();
-        self.draw(&panels, &begin(&mut svg, height, &self.title, &self.note)?)?;
+        self.draw(&panels, &titled(&mut svg, height, &self.title, &self.note)?)?;
         Ok(finish(&svg, height))
     }
 

@@ -32,8 +32,8 @@ const LETTER: f64 = 0.55;
 const MIN_RANGE: f64 = 1e-15;
 pub const MAX_VALUE: f64 = 1e100;
 
-/// Begins a page with a title and a line of small print.
-pub fn begin<'a>(svg: &'a mut String, height: i32, title: &str, note: &str) -> Result<Area<'a>> {
+/// Starts a page with a title and a line of small print.
+pub fn titled<'a>(svg: &'a mut String, height: i32, title: &str, note: &str) -> Result<Area<'a>> {
     let page = SVGBackend::with_string(svg, (WIDTH as u32, height as u32)).into_drawing_area();
     page.fill(&WHITE)?;
     let mut bold = style(TITLE, INK, HPos::Left);

@@ -3,8 +3,8 @@
 use super::shared::{asks_for_help, check_csv, make_folder, write};
 use super::worlds::{Source, WorldFlags};
 use crate::acting::team::Team;
-use crate::benchmark::arena::Arena;
 use crate::benchmark::compare::{Comparison, Results, compare};
+use crate::benchmark::compared_worlds::ComparedWorlds;
 use crate::benchmark::report::common_worlds::check_worlds;
 use crate::benchmark::report::runs_file::{read_runs, write_runs};
 use crate::benchmark::report::{
@@ -101,24 +101,24 @@ impl CompareCommand {
         let mut report = Report::default();
         for source in sources {
             let (seeds, task) = (self.worlds.seeds(&source), source.task().cloned());
-            let arena = &mut source.open((seeds.end - seeds.start) as u32)?;
-            let mut policies = self.policies(&arena.model, &learned, has_teams)?;
-            if arena.lacks_model() && self.policies.is_empty() && !has_teams {
+            let worlds = &mut source.open((seeds.end - seeds.start) as u32)?;
+            let mut policies = self.policies(&worlds.model, &learned, has_teams)?;
+            if worlds.lacks_model() && self.policies.is_empty() && !has_teams {
                 policies.retain(|policy| !policy.belief.knows_model);
             }
-            report.baseline = self.baseline(arena, &policies, has_teams)?;
+            report.baseline = self.baseline(worlds, &policies, has_teams)?;
             let comparison = Comparison {
                 policies,
                 teams: self.team.clone(),
                 seeds,
-                steps: self.worlds.steps(task.as_ref(), arena.info())?,
+                steps: self.worlds.steps(task.as_ref(), worlds.info())?,
                 config: config.clone(),
                 learned: learned.clone(),
                 first_state_known: self.first_state_known,
             };
-            self.check_added(&added, &comparison, arena.info())?;
-            let results = run_comparison(arena, &comparison)?;
-            report.axis_label = axis_label(&arena.model);
+            self.check_added(&added, &comparison, worlds.info())?;
+            let results = run_comparison(worlds, &comparison)?;
+            report.axis_label = axis_label(&worlds.model);
             report.fire_cells = results.fire_cells;
             report.runs.extend(results.runs);
         }
@@ -237,9 +237,14 @@ impl CompareCommand {
     }
 
     /// Returns the name of the baseline: `--baseline`, or the default for options, teams or the ladder.
-    fn baseline(&self, arena: &Arena, policies: &[Policy], has_teams: bool) -> Result<String> {
+    fn baseline(
+        &self,
+        worlds: &ComparedWorlds,
+        policies: &[Policy],
+        has_teams: bool,
+    ) -> Result<String> {
         if let Some(name) = &self.baseline {
-            let policy = Policy::named(name, &arena.model);
+            let policy = Policy::named(name, &worlds.model);
             return Ok(policy.context("--baseline")?.name);
         }
         let mut policies = policies.iter();
@@ -248,7 +253,7 @@ impl CompareCommand {
         } else {
             policies.next().filter(|_| has_teams)
         };
-        let default = if arena.lacks_model() {
+        let default = if worlds.lacks_model() {
             "coverage"
         } else {
             "shooting"
@@ -287,12 +292,15 @@ fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
 }
 
 /// Runs a comparison and logs its progress.
-pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
+pub(super) fn run_comparison(
+    worlds: &mut ComparedWorlds,
+    comparison: &Comparison,
+) -> Result<Results> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
-    let n_contestants = comparison.contestants(&arena.model).len() as u64;
+    let n_contestants = comparison.entries(&worlds.model).len() as u64;
     let n_steps = n_contestants * n_seeds * comparison.steps;
     let (mut done, mut logged, mut last_policy) = (0, Instant::now(), String::new());
-    compare(arena, comparison, &mut |policy, steps| {
+    compare(worlds, comparison, &mut |policy, steps| {
         if last_policy != policy || logged.elapsed() > PROGRESS_INTERVAL {
             tracing::info!(policy, done, of = n_steps, "comparing");
             (logged, last_policy) = (Instant::now(), policy.to_owned());

@@ -6,8 +6,8 @@ use super::compare::run_comparison;
 use super::shared::{asks_for_help, make_folder, write};
 use super::trainings::{Trained, Trainings};
 use crate::acting::team::Team;
-use crate::benchmark::arena::{Arena, MAX_BATCH};
 use crate::benchmark::compare::Comparison;
+use crate::benchmark::compared_worlds::{ComparedWorlds, MAX_BATCH};
 use crate::benchmark::report::common_worlds::{World, check_worlds};
 use crate::benchmark::report::runs_file::{csv_files, file_of, read_tasks, write_runs};
 use crate::benchmark::report::suite::{CEILING, FLOOR, render_suite};
@@ -159,14 +159,14 @@ impl SuiteCommand {
         }
         let mut runs = plan.comparable();
         // Opened after all trainings, because a lease that is not used for long ends.
-        let mut arena = plan.open()?;
+        let mut worlds = plan.open()?;
         for (policy, trained) in ready {
             let comparison = Comparison {
                 policies: vec![policy.clone()],
                 learned: trained.learned,
                 ..plan.comparison.clone()
             };
-            let mut new = run_comparison(&mut arena, &comparison)?.runs;
+            let mut new = run_comparison(&mut worlds, &comparison)?.runs;
             for run in &mut new {
                 run.task.clone_from(task);
                 run.training_seconds = trained.seconds;
@@ -218,12 +218,12 @@ impl Plan {
     }
 
     /// Simulates the worlds, and acquires them.
-    fn open(&self) -> Result<Arena> {
+    fn open(&self) -> Result<ComparedWorlds> {
         let n_worlds = self.worlds.len() as u32;
         let mut settings = self.settings.clone();
         settings.config.seed = self.comparison.seeds.start;
         let settings = settings.with_worlds(n_worlds.min(MAX_BATCH))?;
-        Arena::open(Worlds::simulate(settings)?, n_worlds)
+        ComparedWorlds::open(Worlds::simulate(settings)?, n_worlds)
     }
 
     /// Returns the rows of other policies that are from this suite's worlds.

@@ -1,7 +1,7 @@
 //! Flags that choose the worlds: those of a running server, or worlds that the command simulates.
 
 use super::shared::parse_range;
-use crate::benchmark::arena::{Arena, MAX_BATCH};
+use crate::benchmark::compared_worlds::{ComparedWorlds, MAX_BATCH};
 use crate::client::worlds::Worlds;
 use anyhow::{Context, Result, ensure};
 use clap::{Args, value_parser};
@@ -164,16 +164,16 @@ impl Source {
     ///
     /// # Errors
     /// If there is no such server, the worlds cannot be simulated, or the model of beliefs does not fit them.
-    pub fn open(self, n_seeds: u32) -> Result<Arena> {
+    pub fn open(self, n_seeds: u32) -> Result<ComparedWorlds> {
         match self {
             Self::Server(instance) => {
-                let arena = Arena::open(Worlds::attach(&instance, true)?, n_seeds);
-                arena.with_context(|| format!("instance {:?}", instance.name()))
+                let worlds = ComparedWorlds::open(Worlds::attach(&instance, true)?, n_seeds);
+                worlds.with_context(|| format!("instance {:?}", instance.name()))
             }
             Self::Settings(checked, known) => {
-                let mut arena = Arena::open(Worlds::simulate(*checked)?, n_seeds)?;
-                known.map_or(Ok(()), |model| arena.know(*model))?;
-                Ok(arena)
+                let mut worlds = ComparedWorlds::open(Worlds::simulate(*checked)?, n_seeds)?;
+                known.map_or(Ok(()), |model| worlds.know(*model))?;
+                Ok(worlds)
             }
         }
     }

@@ -56,7 +56,7 @@ pub struct Metrics {
 
 impl Metrics {
     /// Creates the file. `more` names the learner's additional columns.
-    pub fn begin(path: &Path, more: &[&str]) -> Result<Self> {
+    pub fn create(path: &Path, more: &[&str]) -> Result<Self> {
         Self::write(path, more, &[]).with_context(|| of_file(path))
     }
 
@@ -76,7 +76,7 @@ impl Metrics {
         if path.exists() {
             reopen().with_context(|| of_file(path))
         } else {
-            Self::begin(path, more)
+            Self::create(path, more)
         }
     }
 

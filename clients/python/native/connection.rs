@@ -7,7 +7,7 @@ use crate::model::shape_of;
 use crate::owned::Owned;
 use crate::refusal::invalid;
 use crate::samples::{Truth, truth_of};
-use crate::wire::Connection;
+use crate::wire;
 use emberwatch_messages::backend::StepAnswer;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::ConnectionError;
@@ -27,7 +27,7 @@ const BRIEF_NANOS: u64 = 1_000_000;
 
 /// A connection to a server, or worlds in this process. Threads can share it; their requests run one after another.
 #[pyclass(frozen, module = "emberwatch._native")]
-pub struct Server {
+pub struct Connection {
     pub worlds: Owned<Worlds>,
     /// The server's description of itself, from its answer to `hello`.
     pub info: ServerInfo,
@@ -39,11 +39,11 @@ pub struct Server {
 }
 
 #[pymethods]
-impl Server {
+impl Connection {
     #[new]
     fn new(py: Python<'_>, instance: &str, client: &str, seconds: f64) -> PyResult<Self> {
         let name = checked(py, instance)?;
-        let wire = py.detach(|| Connection::open(&name, client, duration(seconds)));
+        let wire = py.detach(|| wire::Connection::open(&name, client, duration(seconds)));
         let wire = wire.map_err(|error| raise(py, error, "'hello'", seconds))?;
         Self::of(py, instance, Worlds::Served(Box::new(wire)))
     }
@@ -134,7 +134,7 @@ impl Server {
     }
 }
 
-impl Server {
+impl Connection {
     fn of(py: Python<'_>, instance: &str, mut worlds: Worlds) -> PyResult<Self> {
         let info = worlds.backend().info().clone();
         Ok(Self {

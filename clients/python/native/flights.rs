@@ -136,7 +136,7 @@ impl Flights {
 
     /// Begins the paths of the rows marked in `begun`. `robots`, `[n_rows, 2]`, and the hidden `states`,
     /// `[n_rows, H, W]`, cover all rows.
-    fn begin(
+    fn start_paths(
         &mut self,
         py: Python<'_>,
         begun: PyReadonlyArray1<'_, bool>,
@@ -219,8 +219,13 @@ impl Flights {
             ));
         }
         let rows = moved.iter().zip(actions).enumerate();
-        let paid =
-            rows.map(|(row, (&moves, &action))| if moves { self.fly(row, action) } else { 0.0 });
+        let paid = rows.map(|(row, (&moves, &action))| {
+            if moves {
+                self.make_move(row, action)
+            } else {
+                0.0
+            }
+        });
         let paid: Vec<f64> = paid.collect();
         Ok(PyArray1::from_vec(py, paid))
     }
@@ -252,7 +257,7 @@ impl Flights {
         }
     }
 
-    fn fly(&mut self, row: usize, action: u8) -> f64 {
+    fn make_move(&mut self, row: usize, action: u8) -> f64 {
         self.moves[row * self.n_moves + self.n_made[row]] = action;
         self.n_made[row] += 1;
         let step = Move::from_low_bits(action.into());

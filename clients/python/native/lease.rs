@@ -2,7 +2,7 @@
 
 use crate::answer::Answer;
 use crate::backend::Worlds;
-use crate::connection::{Server, duration};
+use crate::connection::{Connection, duration};
 use crate::errors::interruption;
 use crate::moves;
 use crate::refusal::invalid;
@@ -15,14 +15,14 @@ use pyo3::prelude::*;
 /// A lease on robots of a server.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Lease {
-    server: Py<Server>,
+    server: Py<Connection>,
     lease: lease::Lease,
 }
 
 #[pymethods]
 impl Lease {
     #[new]
-    fn new(server: Py<Server>, number: u64, first_robot: u32, n_robots: u32) -> Self {
+    fn new(server: Py<Connection>, number: u64, first_robot: u32, n_robots: u32) -> Self {
         let robots = first_robot..first_robot.saturating_add(n_robots);
         let lease = lease::Lease::new(&server.get().info, number, &robots);
         Self { server, lease }
@@ -49,7 +49,7 @@ impl Lease {
     /// Flies a path with each robot. After each timeout, checks whether the worlds have stepped, and sends the paths
     /// again if not. Returns the latest results, and the number of steps missed before them; `None` as in `step`. With
     /// `accepts_late`, a world that steps without these paths causes no error.
-    fn fly(
+    fn send_paths(
         &self,
         py: Python<'_>,
         paths: &Bound<'_, PyAny>,
@@ -67,7 +67,7 @@ impl Lease {
             let warned = self.warn_of_wait(py, first_robot);
             warned.map(|()| false).map_err(interruption)
         };
-        let flown = self.lease.fly(paths, accepts_late, send, waits);
+        let flown = self.lease.send_paths(paths, accepts_late, send, waits);
         let flown = flown.map(|flown| flown.expect("invariant: it is never given up"));
         let n_skipped = flown.as_ref().map_or(0, |flown| flown.1);
         let answer = flown.map(|flown| flown.0);

@@ -48,7 +48,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(moves::moves, module)?)?;
     module.add_class::<answer::Answer>()?;
     module.add_function(wrap_pyfunction!(answer::columns, module)?)?;
-    module.add_class::<connection::Server>()?;
+    module.add_class::<connection::Connection>()?;
     module.add_class::<flights::Flights>()?;
     module.add_class::<windows::Windows>()?;
     module.add_class::<lease::Lease>()?;

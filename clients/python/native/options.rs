@@ -12,7 +12,7 @@ use crate::refusal::{invalid, refused};
 use emberwatch_acting::beliefs::{self, BeliefKind};
 use emberwatch_acting::config::{AgentConfig, PriorKind};
 use emberwatch_acting::learned::Learned;
-use emberwatch_acting::options::{Crew, usual};
+use emberwatch_acting::options::{OptionSetup, usual};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::OPTIONS;
@@ -94,13 +94,13 @@ impl Options {
         let shape = shape_of(py, spec.height, spec.width)?;
         let kind_of_belief = estimator.unwrap_or_else(|| usual(&learned));
         let model = model(py, &spec, kind_of_belief)?;
-        let crew = Crew::new(estimator, learned, model, shape, spec.n_moves);
-        let crew = crew.map_err(|error| refused(py, format!("{error:#}")))?;
+        let setup = OptionSetup::new(estimator, learned, model, shape, spec.n_moves);
+        let setup = setup.map_err(|error| refused(py, format!("{error:#}")))?;
         let config = AgentConfig {
             prior: kind,
             ..AgentConfig::default()
         };
-        let first = if crew.estimator().knows_model {
+        let first = if setup.estimator().knows_model {
             config.prior(spec.burn_in)
         } else {
             Prior::Initial
@@ -113,30 +113,32 @@ impl Options {
             })
         });
         Ok(Self {
-            estimator: crew.estimator().name.into(),
-            first: (first, crew.model().clone()),
+            estimator: setup.estimator().name.into(),
+            first: (first, setup.model().clone()),
             prior: OnceLock::new(),
             worlds: Owned::new(
                 "options",
-                PlannedWorlds::new(crew, n_worlds, watched.transpose()?),
+                PlannedWorlds::new(setup, n_worlds, watched.transpose()?),
             ),
         })
     }
 
     /// Starts an episode in each of `worlds`, with the first belief and a seed. The first call may have to simulate the
     /// first belief, which takes seconds.
-    fn begin(&self, py: Python<'_>, worlds: Vec<usize>, seeds: Vec<u64>) -> PyResult<()> {
+    fn start_episodes(&self, py: Python<'_>, worlds: Vec<usize>, seeds: Vec<u64>) -> PyResult<()> {
         let prior = match self.prior.get() {
             Some(prior) => prior,
             None => {
-                let shape = self.worlds.with(py, |worlds| worlds.crew.shape())?;
+                let shape = self.worlds.with(py, |worlds| worlds.setup.shape())?;
                 let (prior, model) = &self.first;
                 let prior = first_belief(py, *prior, model, shape)?;
                 self.prior.get_or_init(|| prior)
             }
         };
         let seeds = worlds.into_iter().zip(seeds);
-        let begun = self.worlds.with(py, |worlds| worlds.begin(seeds, prior));
+        let begun = self
+            .worlds
+            .with(py, |worlds| worlds.start_episodes(seeds, prior));
         begun?.map_err(|error| raise(py, &error))
     }
 

@@ -5,7 +5,7 @@ use crate::origin::is_short;
 use crate::threads::{Pool, Threads};
 use crate::wire::{Feed, View};
 use anyhow::{Context, Result, ensure};
-use emberwatch_acting::options::{Crew, Planned, Shown};
+use emberwatch_acting::options::{OptionAgent, OptionSetup, Shown};
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
@@ -19,9 +19,9 @@ use numpy::ndarray::{Array3, ArrayView1, s};
 
 /// Beliefs and plans of many worlds.
 pub struct PlannedWorlds {
-    pub crew: Crew,
+    pub setup: OptionSetup,
     /// `None` before a world's first episode.
-    worlds: Vec<Option<Planned>>,
+    worlds: Vec<Option<OptionAgent>>,
     threads: Pool,
     watched: Option<Watched>,
 }
@@ -58,7 +58,7 @@ struct Row<'a> {
 /// The work on one world: its observation, and whether to plan and to publish.
 struct WorldWork<'a> {
     index: usize,
-    planned: &'a mut Planned,
+    planned: &'a mut OptionAgent,
     observed: Row<'a>,
     plans: bool,
     is_shown: bool,
@@ -73,9 +73,9 @@ struct Outlook {
 }
 
 impl PlannedWorlds {
-    pub fn new(crew: Crew, n_worlds: usize, watched: Option<Watched>) -> Self {
+    pub fn new(setup: OptionSetup, n_worlds: usize, watched: Option<Watched>) -> Self {
         Self {
-            crew,
+            setup,
             worlds: (0..n_worlds).map(|_| None).collect(),
             threads: Pool::default(),
             watched,
@@ -83,7 +83,7 @@ impl PlannedWorlds {
     }
 
     /// Returns the world with this number, if an episode has begun there.
-    pub fn world(&mut self, world: usize) -> Option<&mut Planned> {
+    pub fn world(&mut self, world: usize) -> Option<&mut OptionAgent> {
         self.worlds.get_mut(world)?.as_mut()
     }
 
@@ -91,7 +91,7 @@ impl PlannedWorlds {
     ///
     /// # Errors
     /// If a world's number is out of range, or if a belief cannot be built.
-    pub fn begin(
+    pub fn start_episodes(
         &mut self,
         seeds: impl Iterator<Item = (usize, u64)>,
         prior: &Belief,
@@ -99,10 +99,10 @@ impl PlannedWorlds {
         let seeds: Vec<(usize, u64)> = seeds.collect();
         let worlds: Vec<usize> = seeds.iter().map(|&(world, _)| world).collect();
         self.rows(&worlds)?;
-        let Self { crew, threads, .. } = self;
-        let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, crew.begun(prior, seed)?));
+        let Self { setup, threads, .. } = self;
+        let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, setup.begun(prior, seed)?));
         let n_worlds = seeds.len();
-        let begun = threads.work(is_short(crew.estimator(), n_worlds), |threads| {
+        let begun = threads.work(is_short(setup.estimator(), n_worlds), |threads| {
             threads.each(seeds, begin)
         });
         // Either all episodes begin, or none.
@@ -117,13 +117,13 @@ impl PlannedWorlds {
     /// # Errors
     /// If the arrays differ in length, a world's number is out of range, or a belief refuses its frame.
     pub fn update(&mut self, observed: Observed<'_>, plans: bool) -> Result<()> {
-        let n_cells = self.crew.shape().n_cells();
+        let n_cells = self.setup.shape().n_cells();
         observed.check(n_cells)?;
         let is_new = plans && observed.frames.is_some();
         let shown = self.shown(observed.worlds.len() * usize::from(is_new));
         let rows = self.rows(observed.worlds)?;
         let Self {
-            crew,
+            setup,
             threads,
             worlds,
             ..
@@ -140,8 +140,8 @@ impl PlannedWorlds {
             })
         });
         let tasks: Vec<WorldWork<'_>> = tasks.collect();
-        let done = threads.work(is_short(crew.estimator(), tasks.len()), |threads| {
-            work_on(crew, tasks, threads)
+        let done = threads.work(is_short(setup.estimator(), tasks.len()), |threads| {
+            work_on(setup, tasks, threads)
         });
         let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
         self.show(outlooks.into_iter().flatten());
@@ -165,9 +165,9 @@ impl PlannedWorlds {
     pub fn plans(&self) -> (Array3<f32>, Array3<u8>) {
         let dim = (self.worlds.len(), OPTIONS.len());
         let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));
-        let mut paths = Array3::zeros((dim.0, dim.1, self.crew.n_moves()));
+        let mut paths = Array3::zeros((dim.0, dim.1, self.setup.n_moves()));
         for (world, planned) in self.worlds.iter().enumerate() {
-            let proposals = planned.iter().flat_map(Planned::proposals);
+            let proposals = planned.iter().flat_map(OptionAgent::proposals);
             for (option, proposal) in proposals.enumerate() {
                 let of_option = s![world, option, ..];
                 features
@@ -243,11 +243,11 @@ impl<'a> Observed<'a> {
 
 /// Corrects and predicts the beliefs, then plans. Worlds with a refused frame stay unchanged.
 fn work_on(
-    crew: &Crew,
+    setup: &OptionSetup,
     mut tasks: Vec<WorldWork<'_>>,
     threads: Threads,
 ) -> Vec<Result<Option<Outlook>>> {
-    let seen = threads.each(&mut tasks, |task| task.see(crew));
+    let seen = threads.each(&mut tasks, |task| task.see(setup));
     let fits = tasks
         .into_iter()
         .zip(&seen)
@@ -258,8 +258,8 @@ fn work_on(
         .filter(|task| task.observed.frame.is_some());
     let new = new.map(|task| &mut *task.planned);
     match threads {
-        Threads::Several => Planned::predict_all(new),
-        Threads::One => new.for_each(|planned| Planned::predict_all([planned])),
+        Threads::Several => OptionAgent::predict_all(new),
+        Threads::One => new.for_each(|planned| OptionAgent::predict_all([planned])),
     }
     let planning = tasks.into_iter().filter(|task| task.plans);
     threads.each(planning, |task| {
@@ -270,16 +270,16 @@ fn work_on(
 
 impl WorldWork<'_> {
     /// Corrects the belief with the frame, if there is one.
-    fn see(&mut self, crew: &Crew) -> Result<Option<Outlook>> {
+    fn see(&mut self, setup: &OptionSetup) -> Result<Option<Outlook>> {
         let Some(frame) = self.observed.frame else {
             return Ok(None);
         };
         let intent = self
             .is_shown
             .then(|| self.planned.intent(self.observed.flown));
-        let n_observations = crew.model().n_observations();
+        let n_observations = setup.model().n_observations();
         self.planned.see(&Shown {
-            frame: Frame::from_bytes(crew.shape(), n_observations, frame)?,
+            frame: Frame::from_bytes(setup.shape(), n_observations, frame)?,
             reward: (self.observed.world.step > 0).then_some(self.observed.robot.reward),
         })?;
         Ok(intent.map(|intent| Outlook {

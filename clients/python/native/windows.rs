@@ -72,7 +72,7 @@ impl Windows {
 
     /// Begins the paths of the rows marked in `begun`: sets their world channels to `shown`,
     /// `[n_begun, H, W, n_of_world]`, and clears their visited cells.
-    fn begin(
+    fn start_paths(
         &mut self,
         begun: PyReadonlyArray1<'_, bool>,
         shown: PyReadonlyArray4<'_, u8>,

@@ -92,7 +92,7 @@ def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArra
     read = None if path is None else (path, _native.checkpoint_bytes(path))
     options = _native.Options(spec, N_WORLDS, kind, read, "simulated", None)
     worlds = list(range(N_WORLDS))
-    options.begin(worlds, [1000, 1001, 1002])
+    options.start_episodes(worlds, [1000, 1001, 1002])
     for results, frames, _ in flown:
         options.see(worlds, results.view(np.uint8).ravel(), frames)
         left = [options.left(world) for world in worlds]

@@ -128,4 +128,4 @@ def test_flights_refuse_wrong_rows_and_states() -> None:
     begun, robots = np.ones(2, np.bool_), np.zeros((2, 2), np.int64)
     for shape in ((1, 3, 5), (2, 3, 4)):
         with refuses(r"states: expected shape \(2, 3, 5\), got"):
-            flights().begin(begun, robots, np.zeros(shape, np.uint8))
+            flights().start_paths(begun, robots, np.zeros(shape, np.uint8))

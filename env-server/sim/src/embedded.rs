@@ -102,7 +102,7 @@ impl Embedded {
         &mut self,
         mut worlds: Range<usize>,
     ) -> Result<Option<Vec<&Episode>>, ConnectionError> {
-        self.begin(Instant::now())?;
+        self.settle(Instant::now())?;
         let simulator = &self.simulator;
         Ok(worlds.try_fold(Vec::new(), |mut found, world| {
             found.push(simulator.episode(world)?);
@@ -111,7 +111,7 @@ impl Embedded {
     }
 
     /// Prepares for a request: installs worlds whose reset finished since the last call, and ends expired leases.
-    fn begin(&mut self, now: Instant) -> Result<(), ConnectionError> {
+    fn settle(&mut self, now: Instant) -> Result<(), ConnectionError> {
         if self.is_over {
             return Err(ConnectionError::ServerGone {
                 instance: INSTANCE.into(),
@@ -197,7 +197,7 @@ impl Backend for Embedded {
 
     fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError> {
         let (now, client) = (Instant::now(), self.client);
-        self.begin(now)?;
+        self.settle(now)?;
         let stats = ServerStats {
             uptime: now - self.started,
             steps_per_second: self.rate.per_second,
@@ -236,7 +236,7 @@ impl Backend for Embedded {
         _: Duration,
     ) -> Result<StepAnswer, ConnectionError> {
         let now = Instant::now();
-        self.begin(now)?;
+        self.settle(now)?;
         let request = StepRequest {
             version: VERSION,
             ..request

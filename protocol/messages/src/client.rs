@@ -247,7 +247,7 @@ impl<B: Backend> Client<B> {
         let paths = Call::new(request, &moves, STEP_TIMEOUT);
         let (lease, backend) = (&self.lease, &mut self.backend);
         let send = |call: &mut Call<'_>| lease.send(backend, call);
-        let answer = lease.fly(paths, false, send, || Ok(is_over()))?;
+        let answer = lease.send_paths(paths, false, send, || Ok(is_over()))?;
         answer
             .map(|(answer, _)| self.observations(&answer))
             .transpose()

@@ -185,7 +185,7 @@ impl Lease {
     ///
     /// # Errors
     /// The errors of `send` and `gives_up`, and a `Late` refusal if worlds moved without the paths.
-    pub fn fly<'a>(
+    pub fn send_paths<'a>(
         &self,
         mut paths: Call<'a>,
         accepts_late: bool,

@@ -94,7 +94,7 @@ fn call(lease: &Lease, operation: Operation) -> Call<'static> {
 
 /// Flies until the worlds have moved, or gives up after two observations. Returns the observed step and the number of
 /// earlier steps that the client did not see.
-fn fly(
+fn send_paths(
     lease: &Lease,
     script: &mut Script,
     accepts_late: bool,
@@ -106,7 +106,7 @@ fn fly(
         patience -= 1;
         Ok(patience == 0)
     };
-    match lease.fly(paths, accepts_late, send, gives_up) {
+    match lease.send_paths(paths, accepts_late, send, gives_up) {
         Ok(flown) => Ok(flown.map(|(_, n_skipped)| (lease.steps()[0], n_skipped))),
         Err(ConnectionError::Refused { status, .. }) => Err(status),
         Err(other) => panic!("expected a refusal, got {other}"),
@@ -119,7 +119,7 @@ fn check(
     expected: Result<Option<(u64, u64)>, Status>,
 ) -> Vec<Asked> {
     let (lease, mut script) = lease(says);
-    assert_eq!(fly(&lease, &mut script, accepts_late), expected);
+    assert_eq!(send_paths(&lease, &mut script, accepts_late), expected);
     assert!(script.says.is_empty(), "{} left", script.says.len());
     script.asked
 }
@@ -162,7 +162,7 @@ fn fly_beside(other: Operation, after: usize, says: &[Say]) -> Result<(), Status
         }
         answer
     };
-    match lease.fly(call(&lease, Operation::Step), false, send, || Ok(false)) {
+    match lease.send_paths(call(&lease, Operation::Step), false, send, || Ok(false)) {
         Err(ConnectionError::Refused { status, .. }) => Err(status),
         flown => {
             assert!(flown.expect("an answer").is_some());

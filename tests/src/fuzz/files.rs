@@ -203,7 +203,7 @@ fn filter(dimensions: Dimensions) -> Contents {
 fn see_frames(fit: &mut FilterFit) {
     let shape = worlds().shape();
     let belief = Belief::uniform(2, shape);
-    fit.begin(0);
+    fit.start_track(0);
     for value in [0, 1, 1, 0, 1] {
         let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
         let learned = fit.learned();

@@ -11,8 +11,8 @@ use emberwatch_belief::estimation::scoring::{Score, score};
 use emberwatch_belief::planning::options::choose_by_rule;
 use emberwatch_belief::planning::team::{ROUNDS, plan_team};
 use emberwatch_belief::planning::{
-    BasisKind, CellValues, Memory, OPTIONS, Objective, OptionPlanner, Outlook, PathOption, Plan,
-    Planner, Proposal, RandomWalk, Target,
+    BasisKind, CellValues, Memory, OPTIONS, Objective, OptionPlanner, PathOption, Plan, Planner,
+    Proposal, RandomWalk, Target, ValueLayers,
 };
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_model::{Airspace, Cell, Frame, Grid};
@@ -169,7 +169,7 @@ impl Agent {
 
     /// Plans all options from a robot's cell. Each proposal contains the path and the features of one option.
     pub fn propose(&mut self, robot: Cell) -> Vec<Proposal> {
-        self.options.propose(&self.outlook(), robot)
+        self.options.propose(&self.layers(), robot)
     }
 
     /// Records a proposed option as the aim of the next path, and returns its plan.
@@ -179,9 +179,9 @@ impl Agent {
     }
 
     /// Computes the layers of cell values from which options are planned.
-    fn outlook(&self) -> Outlook {
+    fn layers(&self) -> ValueLayers {
         let (belief, air) = (self.basis_belief(), &self.airspace);
-        Outlook::new(belief, air, self.target, &self.memory, self.n_moves)
+        ValueLayers::new(belief, air, self.target, &self.memory, self.n_moves)
     }
 
     /// Returns the belief that paths are planned on.
@@ -191,32 +191,32 @@ impl Agent {
 
     /// Plans an option for each robot in turn. Cells that an earlier robot visits have no value for later robots.
     fn plan_options(&mut self, robots: &[Cell]) -> Vec<Plan> {
-        let mut outlook = self.outlook();
+        let mut layers = self.layers();
         let mut plans: Vec<Plan> = Vec::with_capacity(robots.len());
         for (index, &robot) in robots.iter().enumerate() {
             if let Some(last) = plans.last() {
                 let visited = self.airspace.fly(robots[index - 1], &last.moves).visited;
-                outlook = outlook.without(&visited);
+                layers = layers.without(&visited);
             }
-            plans.push(self.plan_option(&outlook, robot));
+            plans.push(self.plan_option(&layers, robot));
         }
         plans
     }
 
-    fn plan_option(&mut self, outlook: &Outlook, robot: Cell) -> Plan {
+    fn plan_option(&mut self, layers: &ValueLayers, robot: Cell) -> Plan {
         let option = match &self.chooser {
             Chooser::Options(OptionChooser::Always(option)) => option,
             Chooser::Options(OptionChooser::Scorer(scorer)) => {
-                let mut proposals = self.options.propose(outlook, robot);
+                let mut proposals = self.options.propose(layers, robot);
                 let features: Vec<f32> = proposals.iter().flat_map(|it| it.features).collect();
                 let best = scorer.best(&features);
                 OPTIONS[best].name.clone_into(&mut self.aim);
                 return proposals.swap_remove(best).plan;
             }
-            _ => choose_by_rule(outlook, robot),
+            _ => choose_by_rule(layers, robot),
         };
         option.name.clone_into(&mut self.aim);
-        self.options.plan(option, outlook, robot)
+        self.options.plan(option, layers, robot)
     }
 
     /// Plans random moves.

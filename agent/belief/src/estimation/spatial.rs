@@ -85,7 +85,7 @@ impl SpatialFilter {
     ) -> Result<(), ZeroEvidence> {
         let (belief, likelihood) = self.filter.parts();
         self.spread
-            .begin(belief, &self.ages, seen, &self.correlations);
+            .start(belief, &self.ages, seen, &self.correlations);
         for index in 0..self.spread.n_seen() {
             let (cell, observed, mut states) = self.spread.prior(index, belief);
             let innovation = Innovation::of(&states, likelihood, self.state, observed);

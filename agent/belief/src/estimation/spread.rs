@@ -74,7 +74,7 @@ impl Spread {
     }
 
     /// Starts a correction of a belief. `seen` lists the row-major index and the observation of each seen cell.
-    pub fn begin(
+    pub fn start(
         &mut self,
         belief: &Belief,
         ages: &Ages,

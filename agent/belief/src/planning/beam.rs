@@ -144,7 +144,7 @@ impl BeamSearch {
         n_moves: usize,
         stops: &mut impl FnMut() -> bool,
     ) -> Option<Plan> {
-        self.begin(width);
+        self.reset(width);
         for index in 0..n_moves {
             if stops() {
                 return None;
@@ -173,7 +173,7 @@ impl BeamSearch {
     }
 
     /// Makes the start the only state of the beam.
-    fn begin(&mut self, width: usize) {
+    fn reset(&mut self, width: usize) {
         let n_words = self.words_per_state();
         self.visited.clear();
         self.visited.resize(width * n_words, 0);

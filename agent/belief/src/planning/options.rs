@@ -5,8 +5,8 @@
 
 use crate::planning::beam::BeamSearch;
 use crate::planning::objective::{BEAM_BONUS, CellValues};
-use crate::planning::outlook::{Layer, Outlook, distance};
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
+use crate::planning::value_layers::{Layer, ValueLayers, distance};
 use emberwatch_model::{Cell, Grid};
 
 /// An option: a named objective for paths.
@@ -142,52 +142,52 @@ impl OptionPlanner {
     }
 
     /// Plans all options for a robot, in the order of [`OPTIONS`].
-    pub fn propose(&mut self, outlook: &Outlook, robot: Cell) -> Vec<Proposal> {
-        let facts = outlook.facts(robot);
+    pub fn propose(&mut self, layers: &ValueLayers, robot: Cell) -> Vec<Proposal> {
+        let facts = layers.facts(robot);
         let proposals = OPTIONS.iter().enumerate().map(|(index, option)| {
-            let goal = option.goal_on(outlook, robot);
-            let plan = self.plan_to(option, outlook, robot, goal);
-            let features = features(index, outlook, robot, (&plan, goal), &facts);
+            let goal = option.goal_on(layers, robot);
+            let plan = self.plan_to(option, layers, robot, goal);
+            let features = features(index, layers, robot, (&plan, goal), &facts);
             Proposal { plan, features }
         });
         proposals.collect()
     }
 
     /// Plans one option for a robot.
-    pub fn plan(&mut self, option: &PathOption, outlook: &Outlook, robot: Cell) -> Plan {
-        let goal = option.goal_on(outlook, robot);
-        self.plan_to(option, outlook, robot, goal)
+    pub fn plan(&mut self, option: &PathOption, layers: &ValueLayers, robot: Cell) -> Plan {
+        let goal = option.goal_on(layers, robot);
+        self.plan_to(option, layers, robot, goal)
     }
 
     fn plan_to(
         &mut self,
         option: &PathOption,
-        outlook: &Outlook,
+        layers: &ValueLayers,
         robot: Cell,
         goal: Option<Cell>,
     ) -> Plan {
         let mut plan = self.0.plan(&PlanningProblem {
             start: robot,
-            n_moves: outlook.n_moves * option.n_paths,
-            values: &option.values(outlook, goal),
+            n_moves: layers.n_moves * option.n_paths,
+            values: &option.values(layers, goal),
             seed: 0,
             step: 0,
         });
-        plan.moves.truncate(outlook.n_moves);
+        plan.moves.truncate(layers.n_moves);
         plan
     }
 }
 
 impl PathOption {
-    fn goal_on(&self, outlook: &Outlook, robot: Cell) -> Option<Cell> {
-        let best = |layer| outlook.best_region(layer, robot, KEPT_PER_PATH);
+    fn goal_on(&self, layers: &ValueLayers, robot: Cell) -> Option<Cell> {
+        let best = |layer| layers.best_region(layer, robot, KEPT_PER_PATH);
         self.goal.map(best)
     }
 
     /// Returns the cells' values for the option, with an increase towards the goal if there is one.
-    fn values(&self, outlook: &Outlook, goal: Option<Cell>) -> CellValues {
+    fn values(&self, layers: &ValueLayers, goal: Option<Cell>) -> CellValues {
         let [bonus, probability, entropy, novelty] = self.worth;
-        let mut value: Grid<f32> = Grid::zeros(outlook.shape().dim());
+        let mut value: Grid<f32> = Grid::zeros(layers.shape().dim());
         let mut in_sight: Option<Grid<f32>> = None;
         for (weight, layer) in [
             (probability, Layer::Probability),
@@ -197,11 +197,11 @@ impl PathOption {
             if weight == 0.0 {
                 continue;
             }
-            if outlook.counts_in_sight(layer) {
+            if layers.counts_in_sight(layer) {
                 let in_sight = in_sight.get_or_insert_with(|| Grid::zeros(value.dim()));
-                in_sight.scaled_add(weight, outlook.layer(layer));
+                in_sight.scaled_add(weight, layers.layer(layer));
             } else {
-                value.scaled_add(weight, outlook.layer(layer));
+                value.scaled_add(weight, layers.layer(layer));
             }
         }
         if let Some(goal) = goal {
@@ -212,11 +212,11 @@ impl PathOption {
                 *value += SLOPE * (height + width - away) as f32;
             }
         }
-        CellValues::new(value, bonus).within(outlook.airspace(), in_sight)
+        CellValues::new(value, bonus).within(layers.airspace(), in_sight)
     }
 }
 
-impl Outlook {
+impl ValueLayers {
     /// Returns the features that all options share.
     fn facts(&self, robot: Cell) -> [f32; 6] {
         let surplus = |centre| self.around(Layer::Surplus, centre) / REGION_SCALES[1];
@@ -236,27 +236,27 @@ impl Outlook {
 /// Computes the features of an option's path. If the option has no goal, the end of its path is used instead.
 fn features(
     index: usize,
-    outlook: &Outlook,
+    layers: &ValueLayers,
     robot: Cell,
     (plan, goal): (&Plan, Option<Cell>),
     facts: &[f32; 6],
 ) -> [f32; N_FEATURES] {
-    let flight = outlook.airspace().fly(robot, &plan.moves);
-    let seen = outlook.airspace().see(&flight.visited);
+    let flight = layers.airspace().fly(robot, &plan.moves);
+    let seen = layers.airspace().see(&flight.visited);
     let on_path = [Layer::Probability, Layer::Entropy, Layer::Novelty].map(|layer| {
-        let cells = outlook.layer(layer).as_slice();
+        let cells = layers.layer(layer).as_slice();
         let cells = cells.expect("invariant: grids are row-major");
-        let sum: f32 = if outlook.counts_in_sight(layer) {
+        let sum: f32 = if layers.counts_in_sight(layer) {
             seen.iter().map(|&cell| cells[cell]).sum()
         } else {
             flight.visited.iter().map(|&cell| cells[cell]).sum()
         };
-        sum / outlook.n_moves as f32
+        sum / layers.n_moves as f32
     });
     let goal = goal.unwrap_or(flight.end);
     let region =
-        |at| Layer::ALL.map(|layer| outlook.around(layer, at) / REGION_SCALES[layer as usize]);
-    let (height, width) = outlook.shape().dim();
+        |at| Layer::ALL.map(|layer| layers.around(layer, at) / REGION_SCALES[layer as usize]);
+    let (height, width) = layers.shape().dim();
     let distance = robot.row.abs_diff(goal.row) as f32 / height as f32
         + robot.col.abs_diff(goal.col) as f32 / width as f32;
     let mut features = [0.0; N_FEATURES];
@@ -306,11 +306,11 @@ pub fn feature_names() -> Vec<String> {
 
 /// Chooses an option by a hand-written rule: to fly to the best region if its discounted surplus exceeds the surplus
 /// around the robot, otherwise `exploit`.
-pub fn choose_by_rule(outlook: &Outlook, robot: Cell) -> &'static PathOption {
-    let goal = outlook.best_region(Layer::Surplus, robot, KEPT_PER_PATH);
-    let n_paths = distance(robot, goal) as f32 / outlook.n_moves as f32;
-    let away = outlook.around(Layer::Surplus, goal) * KEPT_PER_PATH.powf(n_paths);
-    let here = outlook.around(Layer::Surplus, robot);
+pub fn choose_by_rule(layers: &ValueLayers, robot: Cell) -> &'static PathOption {
+    let goal = layers.best_region(Layer::Surplus, robot, KEPT_PER_PATH);
+    let n_paths = distance(robot, goal) as f32 / layers.n_moves as f32;
+    let away = layers.around(Layer::Surplus, goal) * KEPT_PER_PATH.powf(n_paths);
+    let here = layers.around(Layer::Surplus, robot);
     if away > here { &BEST_REGION } else { &EXPLOIT }
 }
 
@@ -323,7 +323,7 @@ mod tests {
     use emberwatch_model::randomness::split_mix;
     use emberwatch_model::{Airspace, Frame, Move, Probabilities, Shape};
 
-    fn outlook(height: usize, width: usize, n_moves: usize) -> Outlook {
+    fn layers(height: usize, width: usize, n_moves: usize) -> ValueLayers {
         let shape = Shape::new(height, width).expect("test shape");
         let numbers = Probabilities::from_shape_fn((2, height, width), |(state, row, col)| {
             let random = split_mix(5, (row * width + col) as u64) % 1000;
@@ -337,7 +337,7 @@ mod tests {
         every_third.for_each(|cell| frame.observe(cell, 0));
         memory.see(&frame);
         memory.earn(3.0, n_moves);
-        Outlook::new(&belief, &Airspace::open(shape), 1, &memory, n_moves)
+        ValueLayers::new(&belief, &Airspace::open(shape), 1, &memory, n_moves)
     }
 
     /// Returns the best score of all paths, by enumeration.
@@ -353,13 +353,13 @@ mod tests {
     fn each_option_flies_the_best_of_all_paths() {
         let mut planner = OptionPlanner::new(2000);
         for (height, width) in [(1, 4), (5, 3), (30, 40)] {
-            let outlook = outlook(height, width, 3);
+            let layers = layers(height, width, 3);
             let (row, col) = (height / 2, 1);
             let robot = Cell { row, col };
             for option in &OPTIONS {
-                let goal = option.goal_on(&outlook, robot);
-                let values = option.values(&outlook, goal);
-                let plan = planner.plan(option, &outlook, robot);
+                let goal = option.goal_on(&layers, robot);
+                let values = option.values(&layers, goal);
+                let plan = planner.plan(option, &layers, robot);
                 assert_eq!(plan.moves.len(), 3);
                 let best = best_of_all(&values, robot, 3 * option.n_paths.min(2));
                 let is_best = (plan.score - best).abs() < 1e-3 * best.abs().max(1.0);
@@ -372,11 +372,11 @@ mod tests {
     #[test]
     fn options_with_a_goal_fly_towards_it() {
         let mut planner = OptionPlanner::new(30);
-        let (outlook, robot) = (outlook(40, 40, 6), Cell { row: 20, col: 20 });
+        let (layers, robot) = (layers(40, 40, 6), Cell { row: 20, col: 20 });
         for option in OPTIONS.iter().filter(|option| option.goal.is_some()) {
-            let goal = option.goal_on(&outlook, robot).expect("a goal");
-            let plan = planner.plan(option, &outlook, robot);
-            let end = fly(outlook.shape(), robot, &plan.moves).end;
+            let goal = option.goal_on(&layers, robot).expect("a goal");
+            let plan = planner.plan(option, &layers, robot);
+            let end = fly(layers.shape(), robot, &plan.moves).end;
             let left = distance(robot, goal).saturating_sub(6 + 2 * GOAL_RADIUS);
             let is_near = distance(end, goal) <= left + 2 * GOAL_RADIUS;
             assert!(is_near, "{}: {end} {goal}", option.name);
@@ -390,20 +390,20 @@ mod tests {
         let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
         assert_eq!((names.len(), distinct.len()), (N_FEATURES, N_FEATURES));
         assert_eq!(N_FEATURES, 26);
-        let (outlook, robot) = (outlook(20, 30, 5), Cell { row: 3, col: 4 });
-        let proposals = OptionPlanner::new(30).propose(&outlook, robot);
+        let (layers, robot) = (layers(20, 30, 5), Cell { row: 3, col: 4 });
+        let proposals = OptionPlanner::new(30).propose(&layers, robot);
         for (index, proposal) in proposals.iter().enumerate() {
             let feature = |name: &str| {
                 let at = names.iter().position(|known| known == name);
                 proposal.features[at.expect(name)]
             };
-            let flight = fly(outlook.shape(), robot, &proposal.plan.moves);
+            let flight = fly(layers.shape(), robot, &proposal.plan.moves);
             let novelty = flight.visited.iter().filter(|cell| *cell % 3 != 0).count();
             assert!((feature("path_novelty") - novelty as f32 / 5.0).abs() < 1e-3);
-            let end = outlook.around(Layer::Entropy, flight.end) / 169.0;
+            let end = layers.around(Layer::Entropy, flight.end) / 169.0;
             assert_eq!(feature("end_entropy"), end);
             let option = &OPTIONS[index];
-            let goal = option.goal_on(&outlook, robot).unwrap_or(flight.end);
+            let goal = option.goal_on(&layers, robot).unwrap_or(flight.end);
             let away = robot.row.abs_diff(goal.row) as f32 / 20.0;
             let away = away + robot.col.abs_diff(goal.col) as f32 / 30.0;
             assert!((feature("goal_distance") - away).abs() < 1e-6);
@@ -422,8 +422,9 @@ mod tests {
             let mut states = Grid::zeros((40, 40));
             states[[row, 5]] = 1;
             let belief = Belief::from_states(&states, 2).expect("valid states");
-            let outlook = Outlook::new(&belief, &Airspace::open(shape), 1, &Memory::new(shape), 6);
-            choose_by_rule(&outlook, Cell { row: 3, col: 5 }).name
+            let layers =
+                ValueLayers::new(&belief, &Airspace::open(shape), 1, &Memory::new(shape), 6);
+            choose_by_rule(&layers, Cell { row: 3, col: 5 }).name
         };
         assert_eq!([choice(4), choice(35)], ["exploit", "best_region"]);
     }

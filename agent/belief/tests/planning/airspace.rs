@@ -3,8 +3,8 @@
 use super::fields::Field;
 use emberwatch_belief::planning::team::plan_team;
 use emberwatch_belief::planning::{
-    Ahead, BeamSearch, Integration, Memory, OPTIONS, Objective, OptionPlanner, Outlook, Planner,
-    RandomWalk, Shooting, Target,
+    Ahead, BeamSearch, Integration, Memory, OPTIONS, Objective, OptionPlanner, Planner, RandomWalk,
+    Shooting, Target, ValueLayers,
 };
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Airspace, Cell, Grid, Move, Shape};
@@ -106,8 +106,8 @@ proptest! {
         let paths = [0, 1].map(|robot| &*team[robot].moves);
         let (gains, together) = (team[0].score + team[1].score, score(objective, &field, &air, &paths));
         prop_assert!((gains - together).abs() < 1e-3, "{gains} {together}");
-        let outlook = Outlook::new(&field.belief, &air, 0, &Memory::new(shape), 5);
-        let proposals = OptionPlanner::new(20).propose(&outlook, start);
+        let layers = ValueLayers::new(&field.belief, &air, 0, &Memory::new(shape), 5);
+        let proposals = OptionPlanner::new(20).propose(&layers, start);
         prop_assert_eq!(proposals.len(), OPTIONS.len());
         for proposal in proposals {
             prop_assert!(avoids(&air, start, &proposal.plan.moves));

@@ -8,7 +8,7 @@ use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
 use emberwatch_acting::policy::Policy;
 use emberwatch_acting::rollout::agent::{Agent, Chooser, Setup};
-use emberwatch_acting::rollout::{Actor, Rollout, Seen};
+use emberwatch_acting::rollout::{ActingAgent, Actor, AgentObservation};
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::observation::Observation;
@@ -46,7 +46,7 @@ pub struct LearnerKind {
     /// Loads from a checkpoint the values that policies use. Returns whether it replaced a different value.
     pub read: fn(&Contents, &Device, &mut Learned) -> Result<bool>,
     /// Creates a learner, or resumes one from a checkpoint.
-    pub begin: fn(Beginning<'_>) -> Result<Box<dyn Learner>>,
+    pub build: fn(LearnerInputs<'_>) -> Result<Box<dyn Learner>>,
 }
 
 impl PartialEq for LearnerKind {
@@ -63,7 +63,7 @@ impl fmt::Debug for LearnerKind {
 
 /// The inputs for creating a learner.
 #[derive(Clone)]
-pub struct Beginning<'a> {
+pub struct LearnerInputs<'a> {
     pub worlds: Worlds,
     /// The server's description of itself.
     pub info: &'a ServerInfo,
@@ -101,16 +101,16 @@ impl Worlds {
         self.airspace.shape()
     }
 
-    /// Creates a rollout whose belief has not been corrected yet. `target` is the index of the state with the highest
+    /// Creates an agent whose belief has not been corrected yet. `target` is the index of the state with the highest
     /// reward.
-    pub(super) fn rollout(
+    pub(super) fn new_agent(
         &self,
         config: &AgentConfig,
         (policy, target): (&Policy, usize),
         estimator: Box<dyn Estimator>,
         state_names: Vec<String>,
         observation: Observation,
-    ) -> Rollout {
+    ) -> ActingAgent {
         let setup = Setup {
             airspace: self.airspace.clone(),
             basis: config.objective.belief,
@@ -122,7 +122,7 @@ impl Worlds {
             chooser: Chooser::Objective(policy.objective(target, config)),
         };
         let agent = Agent::new(estimator, policy, config, setup);
-        Rollout::new(agent, Seen::new([observation]))
+        ActingAgent::new(agent, AgentObservation::new([observation]))
     }
 }
 
@@ -134,13 +134,13 @@ pub trait Learner: Actor {
     }
 
     /// Begins a robot's next episode. The first episodes begin in the order of the robots.
-    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()>;
+    fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()>;
 
     /// Makes the updates that are due after the steps since the last call.
     fn learn(&mut self) -> Result<Vec<ModelUpdate>>;
 
-    /// Returns the rollout of a robot, by index.
-    fn rollout(&self, index: usize) -> &Rollout;
+    /// Returns the agent of a robot, by index.
+    fn agent(&self, index: usize) -> &ActingAgent;
 
     /// Returns the state with the highest estimated reward.
     fn target(&self) -> usize;

@@ -11,13 +11,15 @@ pub use self::saved::{SHAPE, SavedDecisions};
 use self::run::{Held, Run, features};
 use self::saved::SavedBelief;
 use crate::checkpoint::{Contents, check};
-use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, lacks_steps, replace};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, lacks_steps, replace};
 use crate::learners::update::ModelUpdate;
 use anyhow::Result;
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::parallel::in_parallel;
 use emberwatch_acting::policy::Policy;
-use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
+use emberwatch_acting::rollout::{
+    ActingAgent, Actor, AgentObservation, StepRecord, predict_all, see_all,
+};
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
@@ -42,10 +44,10 @@ pub const DECISIONS: LearnerKind = LearnerKind {
         Ok(())
     },
     read: saved::read,
-    begin,
+    build,
 };
 
-fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+fn build(on: LearnerInputs<'_>) -> Result<Box<dyn Learner>> {
     let base = match on.contents {
         Some(contents) => {
             let saved: SavedDecisions = contents.state()?;
@@ -96,12 +98,12 @@ impl DecisionsLearner {
         Ok(learner)
     }
 
-    /// Creates a rollout whose belief has not been corrected yet.
-    fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
+    /// Creates an agent whose belief has not been corrected yet.
+    fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let (base, names) = (&self.base, self.base.state_names.clone());
         let (config, policy) = (&self.config, (&self.policy, self.base.target));
         let (estimator, worlds) = (base.estimator()?, &self.worlds);
-        Ok(worlds.rollout(config, policy, estimator, names, observation))
+        Ok(worlds.new_agent(config, policy, estimator, names, observation))
     }
 
     /// Chooses the option that a robot flies: the option with the highest value, or a random option that it keeps for
@@ -164,9 +166,9 @@ impl Actor for DecisionsLearner {
         self.runs.iter_mut().map(Run::take_up).collect()
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
-        let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
-        let records = see_all(rollouts, seen)?;
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
+        let agents = self.runs.iter_mut().map(|run| &mut run.acting);
+        let records = see_all(agents, seen)?;
         let scale = self.config.decisions.reward_scale / self.worlds.n_moves as f32;
         for (run, record) in self.runs.iter_mut().zip(&records) {
             if let Some((_, scaled)) = &mut run.last {
@@ -180,16 +182,16 @@ impl Actor for DecisionsLearner {
     }
 
     fn predict(&mut self) {
-        predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
+        predict_all(self.runs.iter_mut().map(|run| &mut run.acting));
     }
 }
 
 impl Learner for DecisionsLearner {
-    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let mut rollout = self.rollout_at(observation)?;
-        rollout.correct()?;
-        rollout.agent.predict();
-        let run = Run::begun(rollout, &self.dqn);
+    fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        let mut acting = self.agent_at(observation)?;
+        acting.correct()?;
+        acting.agent.predict();
+        let run = Run::begun(acting, &self.dqn);
         if let Some(mut ended) = replace(&mut self.runs, &self.worlds, robot, run) {
             let transitions = ended.end(&self.dqn).into_iter();
             transitions.for_each(|transition| self.dqn.remember(transition));
@@ -217,8 +219,8 @@ impl Learner for DecisionsLearner {
         Ok(updates)
     }
 
-    fn rollout(&self, index: usize) -> &Rollout {
-        &self.runs[index].rollout
+    fn agent(&self, index: usize) -> &ActingAgent {
+        &self.runs[index].acting
     }
 
     fn target(&self) -> usize {

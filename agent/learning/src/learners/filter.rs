@@ -7,7 +7,7 @@ mod saved;
 pub use self::saved::SavedFilter;
 
 use crate::checkpoint::Contents;
-use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, replace};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
 use crate::learners::filter::fit::FilterFit;
 use crate::learners::update::ModelUpdate;
 use anyhow::{Result, ensure};
@@ -16,7 +16,9 @@ use emberwatch_acting::beliefs::{LEARNED, numbered_states};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::parallel::in_parallel;
 use emberwatch_acting::policy::Policy;
-use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
+use emberwatch_acting::rollout::{
+    ActingAgent, Actor, AgentObservation, StepRecord, predict_all, see_all,
+};
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
@@ -30,7 +32,7 @@ pub struct FilterLearner {
     config: AgentConfig,
     fit: FilterFit,
     learned: LearnedModel,
-    rollouts: Vec<Rollout>,
+    agents: Vec<ActingAgent>,
     /// The last plan of each robot, with the belief that it was based on.
     planned: Vec<(Belief, Plan)>,
 }
@@ -55,10 +57,10 @@ pub const FILTER: LearnerKind = LearnerKind {
         let model = contents.state::<SavedFilter>()?.model;
         Ok(learned.put(model.read(&contents.part(""))?))
     },
-    begin,
+    build,
 };
 
-fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+fn build(on: LearnerInputs<'_>) -> Result<Box<dyn Learner>> {
     let dimensions = dimensions(on.config, &on.worlds)?;
     ensure!(
         !on.config.full_frames || on.info.coverage != CoverageRule::Path,
@@ -96,19 +98,19 @@ impl FilterLearner {
             fit,
             worlds,
             config: config.clone(),
-            rollouts: Vec::new(),
+            agents: Vec::new(),
             planned: Vec::new(),
         })
     }
 
-    /// Creates a robot's rollout, whose belief has not been corrected yet.
-    fn rollout_at(&self, observation: Observation) -> Rollout {
+    /// Creates a robot's acting, whose belief has not been corrected yet.
+    fn agent_at(&self, observation: Observation) -> ActingAgent {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));
         let names = numbered_states(tables.dimensions.n_states);
         let (policy, target) = (Policy::exploiting(&LEARNED), self.learned.target);
         let (worlds, config) = (&self.worlds, &self.config);
-        worlds.rollout(
+        worlds.new_agent(
             config,
             (&policy, target),
             Box::new(filter),
@@ -121,9 +123,9 @@ impl FilterLearner {
     fn n_walking(&self) -> usize {
         let learning = &self.config.learning;
         if self.fit.world_steps < learning.explore_steps {
-            return self.rollouts.len();
+            return self.agents.len();
         }
-        (learning.explore_share * self.rollouts.len() as f64).round() as usize
+        (learning.explore_share * self.agents.len() as f64).round() as usize
     }
 }
 
@@ -133,16 +135,16 @@ impl Actor for FilterLearner {
         let (n_walking, tables) = (self.n_walking(), &self.learned.tables);
         let policy = Policy::exploiting(&LEARNED);
         let objective = policy.objective(self.learned.target, &self.config);
-        let rollouts = self.rollouts.iter_mut().enumerate();
-        self.planned = in_parallel(rollouts, |(index, rollout)| {
-            let belief = rollout.agent.belief().clone();
+        let agents = self.agents.iter_mut().enumerate();
+        self.planned = in_parallel(agents, |(index, acting)| {
+            let belief = acting.agent.belief().clone();
             let filter = BayesFilter::learned(tables, belief.clone());
-            rollout.agent.set_estimator(Box::new(filter));
-            let (cells, step) = (rollout.cells(), rollout.step());
+            acting.agent.set_estimator(Box::new(filter));
+            let (cells, step) = (acting.cells(), acting.step());
             let mut plans = if index < n_walking {
-                rollout.agent.walk(&cells, step)
+                acting.agent.walk(&cells, step)
             } else {
-                rollout.agent.plan_for(objective, &cells, step)
+                acting.agent.plan_for(objective, &cells, step)
             };
             (belief, plans.remove(0))
         });
@@ -150,24 +152,24 @@ impl Actor for FilterLearner {
         plans.map(|(_, plan)| plan.moves.clone()).collect()
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
-        let records = see_all(&mut self.rollouts, seen)?;
-        let runs = self.rollouts.iter().zip(&self.planned).zip(&records);
-        for (robot, ((rollout, (predictor, plan)), record)) in
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
+        let records = see_all(&mut self.agents, seen)?;
+        let runs = self.agents.iter().zip(&self.planned).zip(&records);
+        for (robot, ((acting, (predictor, plan)), record)) in
             (self.worlds.numbers.start..).zip(runs)
         {
-            let frame = &rollout.observation().frame;
+            let frame = &acting.observation().frame;
             let start = record.before.robot.cell();
             let flight = self.worlds.airspace.fly(start, &plan.moves);
             self.fit.see(robot, frame, Some(predictor), &self.learned);
-            let belief = rollout.agent.belief();
+            let belief = acting.agent.belief();
             self.fit.earn(belief, &flight.visited, record.reward);
         }
         Ok(records)
     }
 
     fn predict(&mut self) {
-        predict_all(&mut self.rollouts);
+        predict_all(&mut self.agents);
     }
 }
 
@@ -176,13 +178,13 @@ impl Learner for FilterLearner {
         self.config.full_frames
     }
 
-    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        self.fit.begin(robot);
+    fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        self.fit.start_track(robot);
         self.fit.see(robot, &observation.frame, None, &self.learned);
-        let mut rollout = self.rollout_at(observation);
-        rollout.correct()?;
-        rollout.agent.predict();
-        replace(&mut self.rollouts, &self.worlds, robot, rollout);
+        let mut acting = self.agent_at(observation);
+        acting.correct()?;
+        acting.agent.predict();
+        replace(&mut self.agents, &self.worlds, robot, acting);
         Ok(())
     }
 
@@ -196,8 +198,8 @@ impl Learner for FilterLearner {
         Ok(self.fit.learn()?.into_iter().map(update).collect())
     }
 
-    fn rollout(&self, index: usize) -> &Rollout {
-        &self.rollouts[index]
+    fn agent(&self, index: usize) -> &ActingAgent {
+        &self.agents[index]
     }
 
     fn target(&self) -> usize {

@@ -13,14 +13,16 @@ use anyhow::{Result, ensure};
 use emberwatch_messages::control::{CoverageRule, ServerInfo};
 
 use crate::checkpoint::Contents;
-use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds};
 use crate::learners::update::ModelUpdate;
 use crate::reward::met;
 use emberwatch_acting::beliefs::autoencoder::AutoencoderEstimator;
 use emberwatch_acting::beliefs::{cast, numbered_states};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::policy::{Policy, network_choices};
-use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
+use emberwatch_acting::rollout::{
+    ActingAgent, Actor, AgentObservation, StepRecord, predict_all, see_all,
+};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::Move;
 use emberwatch_network::{FrameReplay, Track, Transition, Window};
@@ -41,10 +43,10 @@ pub const AUTOENCODER: LearnerKind = LearnerKind {
     read: |contents, device, learned| {
         Ok(learned.put(Progress::read(contents, device)?.into_model()))
     },
-    begin,
+    build,
 };
 
-fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+fn build(on: LearnerInputs<'_>) -> Result<Box<dyn Learner>> {
     let mut progress = Progress::first(&on.worlds.form(), on.config, on.device)?;
     if let Some(contents) = on.contents {
         progress.load(contents)?;
@@ -95,8 +97,8 @@ pub struct NetworkLearner {
     /// The latest steps, whose transitions are not yet in the DQN's replay buffer.
     track: Track,
     choices: Vec<Policy>,
-    /// The rollout, once attached to a world.
-    rollout: Option<Rollout>,
+    /// The acting, once attached to a world.
+    acting: Option<ActingAgent>,
     /// The last decision, with its path.
     decision: Option<Decision>,
 }
@@ -119,19 +121,19 @@ impl NetworkLearner {
             progress,
             worlds,
             config: config.clone(),
-            rollout: None,
+            acting: None,
             decision: None,
         }
     }
 
-    fn at_world(&self) -> &Rollout {
-        let rollout = self.rollout.as_ref();
-        rollout.expect("invariant: a world begins before it is acted on")
+    fn at_world(&self) -> &ActingAgent {
+        let acting = self.acting.as_ref();
+        acting.expect("invariant: a world begins before it is acted on")
     }
 
-    fn at_world_mut(&mut self) -> &mut Rollout {
-        let rollout = self.rollout.as_mut();
-        rollout.expect("invariant: a world begins before it is acted on")
+    fn at_world_mut(&mut self) -> &mut ActingAgent {
+        let acting = self.acting.as_mut();
+        acting.expect("invariant: a world begins before it is acted on")
     }
 
     /// Returns the input of the next action: `h_{k+1}`, which depends on the last frame.
@@ -200,9 +202,9 @@ impl Actor for NetworkLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let mut decision = self.decide();
         let objective = self.choices[decision.action].objective(0, &self.config);
-        let rollout = self.at_world_mut();
-        let (cells, step) = (rollout.cells(), rollout.step());
-        decision.path = rollout
+        let acting = self.at_world_mut();
+        let (cells, step) = (acting.cells(), acting.step());
+        decision.path = acting
             .agent
             .plan_for(objective, &cells, step)
             .remove(0)
@@ -212,14 +214,14 @@ impl Actor for NetworkLearner {
         paths
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
-        let records = see_all(&mut self.rollout, seen)?;
-        let (record, rollout) = (&records[0], self.at_world());
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
+        let records = see_all(&mut self.acting, seen)?;
+        let (record, acting) = (&records[0], self.at_world());
         let path = self.decision.as_ref().map(|decision| &*decision.path);
         let start = record.before.robot.cell();
         let flight = self.worlds.airspace.fly(start, path.unwrap_or_default());
-        let met = met(rollout.agent.belief(), &flight.visited);
-        let frame = rollout.observation().frame.clone();
+        let met = met(acting.agent.belief(), &flight.visited);
+        let frame = acting.observation().frame.clone();
         self.progress.reward.add(&met, record.reward);
         self.progress.iterations += 1;
         self.replay.push(frame);
@@ -227,7 +229,7 @@ impl Actor for NetworkLearner {
     }
 
     fn predict(&mut self) {
-        predict_all(&mut self.rollout);
+        predict_all(&mut self.acting);
         self.remember();
     }
 }
@@ -237,20 +239,20 @@ impl Learner for NetworkLearner {
         self.progress.iterations < self.config.autoencoder.full_frames
     }
 
-    fn begin(&mut self, _: u32, observation: Observation) -> Result<()> {
+    fn start_episode(&mut self, _: u32, observation: Observation) -> Result<()> {
         self.track = self.progress.dqn.track();
-        self.replay.begin();
+        self.replay.start_track();
         self.replay.push(observation.frame.clone());
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::new(network)?;
         let names = numbered_states(network.shape().n_states);
         // The initial policy is the first choice, whose target is the first state.
         let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
-        let mut rollout =
-            worlds.rollout(&self.config, first, Box::new(estimator), names, observation);
-        rollout.correct()?;
-        rollout.agent.predict();
-        self.rollout = Some(rollout);
+        let mut acting =
+            worlds.new_agent(&self.config, first, Box::new(estimator), names, observation);
+        acting.correct()?;
+        acting.agent.predict();
+        self.acting = Some(acting);
         Ok(())
     }
 
@@ -279,7 +281,7 @@ impl Learner for NetworkLearner {
         }])
     }
 
-    fn rollout(&self, _: usize) -> &Rollout {
+    fn agent(&self, _: usize) -> &ActingAgent {
         self.at_world()
     }
 

@@ -12,7 +12,7 @@ pub use self::saved::SavedNeural;
 use self::behaviour::Behaviour;
 use self::replay::LessonReplay;
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::learners::base::{Beginning, Learner, LearnerKind, Worlds, lacks_steps, replace};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, lacks_steps, replace};
 use crate::learners::update::ModelUpdate;
 use crate::models::{SavedNeuralModel, corrected_tensors};
 use crate::reward::{RewardEstimate, met};
@@ -23,10 +23,12 @@ use emberwatch_acting::beliefs::{LEARNED, LearnedBelief, NEURAL as BELIEF, cast,
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::parallel::in_parallel;
 use emberwatch_acting::policy::Policy;
-use emberwatch_acting::rollout::{Actor, Rollout, Seen, StepRecord, predict_all, see_all};
+use emberwatch_acting::rollout::{
+    ActingAgent, Actor, AgentObservation, StepRecord, predict_all, see_all,
+};
 use emberwatch_messages::observation::Observation;
-use emberwatch_model::{Move, Probabilities};
 use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_model::{Move, Probabilities};
 use emberwatch_network::{Device, NeuralBelief};
 
 pub const NEURAL: LearnerKind = LearnerKind {
@@ -46,10 +48,10 @@ pub const NEURAL: LearnerKind = LearnerKind {
         let model = contents.state::<SavedNeural>()?.model;
         Ok(learned.put(model.read(&contents.part(""), device)?))
     },
-    begin,
+    build,
 };
 
-fn begin(on: Beginning<'_>) -> Result<Box<dyn Learner>> {
+fn build(on: LearnerInputs<'_>) -> Result<Box<dyn Learner>> {
     let filter = on.learned.get::<LearnedModel>();
     let learner = NeuralLearner::new(on.contents, filter, on.worlds, on.config, on.device);
     Ok(Box::new(learner?))
@@ -71,7 +73,7 @@ pub struct NeuralLearner {
 
 /// A robot in its world.
 struct Run {
-    rollout: Rollout,
+    acting: ActingAgent,
     behaviour: Option<Behaviour>,
     path: Vec<Move>,
 }
@@ -111,14 +113,14 @@ impl NeuralLearner {
         self.reward.target().unwrap_or(last)
     }
 
-    /// Creates a robot's rollout, whose belief has not been corrected yet.
-    fn rollout_at(&self, observation: Observation) -> Result<Rollout> {
+    /// Creates a robot's acting, whose belief has not been corrected yet.
+    fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let filter = self.filter.as_deref();
         let estimator = estimator(&self.network, filter, self.worlds.shape())?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, target) = (Policy::exploiting(&BELIEF), self.paying());
         let (estimator, worlds) = (Box::new(estimator), &self.worlds);
-        Ok(worlds.rollout(
+        Ok(worlds.new_agent(
             &self.config,
             (&policy, target),
             estimator,
@@ -164,8 +166,8 @@ impl Actor for NeuralLearner {
         let (seed, step) = (self.config.seed, self.world_steps);
         let mut runs = std::mem::take(&mut self.runs);
         let paths = in_parallel(runs.iter_mut().enumerate(), |(index, run)| {
-            let (cells, k) = (run.rollout.cells(), run.rollout.step());
-            let agent = &mut run.rollout.agent;
+            let (cells, k) = (run.acting.cells(), run.acting.step());
+            let agent = &mut run.acting.agent;
             let mut rng = stream(seed, Purpose::Exploration, step + index as u64);
             let behaviour =
                 Behaviour::next(run.behaviour, is_exploring, self.worlds.shape(), &mut rng);
@@ -187,17 +189,17 @@ impl Actor for NeuralLearner {
         paths
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
-        let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
-        let records = see_all(rollouts, seen)?;
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
+        let agents = self.runs.iter_mut().map(|run| &mut run.acting);
+        let records = see_all(agents, seen)?;
         let runs = self.worlds.numbers.clone().zip(&self.runs);
         for ((robot, run), record) in runs.zip(&records) {
-            let (belief, observation) = (run.rollout.agent.belief(), run.rollout.observation());
+            let (belief, observation) = (run.acting.agent.belief(), run.acting.observation());
             let start = record.before.robot.cell();
             let flight = self.worlds.airspace.fly(start, &run.path);
             self.reward
                 .add(&met(belief, &flight.visited), record.reward);
-            let base = base(&run.rollout);
+            let base = base(&run.acting);
             self.replay.push(robot, &observation.frame, base);
         }
         let n_robots = records.len() as u64;
@@ -207,20 +209,20 @@ impl Actor for NeuralLearner {
     }
 
     fn predict(&mut self) {
-        predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
+        predict_all(self.runs.iter_mut().map(|run| &mut run.acting));
     }
 }
 
 impl Learner for NeuralLearner {
-    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let mut rollout = self.rollout_at(observation)?;
-        self.replay.begin(robot, self.worlds.shape());
-        let base = base(&rollout);
-        self.replay.push(robot, &rollout.observation().frame, base);
-        rollout.correct()?;
-        rollout.agent.predict();
+    fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
+        let mut acting = self.agent_at(observation)?;
+        self.replay.start_track(robot, self.worlds.shape());
+        let base = base(&acting);
+        self.replay.push(robot, &acting.observation().frame, base);
+        acting.correct()?;
+        acting.agent.predict();
         let run = Run {
-            rollout,
+            acting,
             behaviour: None,
             path: Vec::new(),
         };
@@ -249,8 +251,8 @@ impl Learner for NeuralLearner {
         Ok(updates)
     }
 
-    fn rollout(&self, index: usize) -> &Rollout {
-        &self.runs[index].rollout
+    fn agent(&self, index: usize) -> &ActingAgent {
+        &self.runs[index].acting
     }
 
     fn target(&self) -> usize {
@@ -292,6 +294,6 @@ impl Learner for NeuralLearner {
 }
 
 /// Returns the distribution of each cell's next observation that the refined filter predicts, shape `[O, H, W]`.
-fn base(rollout: &Rollout) -> Option<&Probabilities> {
-    cast::<NeuralEstimator>(rollout.agent.estimator()).base()
+fn base(acting: &ActingAgent) -> Option<&Probabilities> {
+    cast::<NeuralEstimator>(acting.agent.estimator()).base()
 }

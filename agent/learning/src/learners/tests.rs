@@ -12,7 +12,7 @@ use emberwatch_acting::beliefs::neural::NeuralModel;
 use emberwatch_acting::beliefs::{KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
-use emberwatch_acting::rollout::Seen;
+use emberwatch_acting::rollout::AgentObservation;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::planning::BasisKind;
@@ -67,19 +67,19 @@ fn observation(step: u64) -> Observation {
 }
 
 /// Makes one step. Returns the posterior after its frame.
-fn fly(learner: &mut impl Learner, step: u64) -> Belief {
+fn take_step(learner: &mut impl Learner, step: u64) -> Belief {
     learner.plan();
-    let seen = vec![Seen::new([observation(step)])];
+    let seen = vec![AgentObservation::new([observation(step)])];
     learner.see(seen).expect("possible");
-    let posterior = learner.rollout(0).agent.belief().clone();
+    let posterior = learner.agent(0).agent.belief().clone();
     learner.predict();
     posterior
 }
 
 fn check_basis(mut learner: impl Learner, basis: BasisKind) {
-    learner.begin(0, observation(0)).expect("possible");
-    let estimate = fly(&mut learner, 1);
-    let agent = &learner.rollout(0).agent;
+    learner.start_episode(0, observation(0)).expect("possible");
+    let estimate = take_step(&mut learner, 1);
+    let agent = &learner.agent(0).agent;
     let is_basis = [&estimate, agent.belief()].map(|belief| belief == agent.basis_belief());
     let is_estimate = basis == BasisKind::Estimate;
     assert_eq!(
@@ -116,7 +116,7 @@ fn known_base() -> Base {
 /// Makes steps with updates. Returns the contents of a checkpoint afterwards.
 fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
     for step in steps {
-        fly(learner, step);
+        take_step(learner, step);
         learner.learn().expect("finite");
     }
     learner.contents().expect("whole")
@@ -155,7 +155,7 @@ fn decisions_continue_from_what_was_learned() {
     ] {
         let base = Base::new(kind, None, learned, worlds().shape()).expect("learned");
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
-        learner.begin(0, observation(0)).expect("possible");
+        learner.start_episode(0, observation(0)).expect("possible");
         let first = learner.contents().expect("whole");
         let left = learn(&mut learner, 1..12);
         assert!(left.tensors != first.tensors, "something was learned");
@@ -165,7 +165,7 @@ fn decisions_continue_from_what_was_learned() {
         let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);
         let mut resumed = resumed.expect("its own");
         assert!(resumed.contents().expect("whole") == left, "{kind:?}");
-        resumed.begin(0, observation(12)).expect("possible");
+        resumed.start_episode(0, observation(12)).expect("possible");
         learn(&mut resumed, 13..24);
         assert!(resumed.n_updates() > learner.n_updates(), "{kind:?}");
     }
@@ -173,17 +173,19 @@ fn decisions_continue_from_what_was_learned() {
 
 /// Flies an episode in which the reward of a step is its number, and begins the next one.
 fn fly_episode(learner: &mut impl Learner, (n_steps, is_terminated): (u64, bool)) {
-    learner.begin(0, observation(0)).expect("possible");
+    learner.start_episode(0, observation(0)).expect("possible");
     for step in 1..=n_steps {
         learner.plan();
         let mut seen = observation(step);
         seen.robot.reward = step as f64;
         seen.world.truncated = u16::from(step == n_steps && !is_terminated);
         seen.world.terminated = u16::from(step == n_steps && is_terminated);
-        learner.see(vec![Seen::new([seen])]).expect("possible");
+        learner
+            .see(vec![AgentObservation::new([seen])])
+            .expect("possible");
         learner.predict();
     }
-    learner.begin(0, observation(0)).expect("possible");
+    learner.start_episode(0, observation(0)).expect("possible");
 }
 
 /// Lengths of episodes, and whether they are terminated. Others are truncated.
@@ -242,10 +244,10 @@ fn the_network_learns_from_every_step_of_an_episode() {
 /// Checks that the step size falls linearly over 10 steps, to a fifth of `rate`. `rate_of` returns an update's step
 /// size.
 fn check_rates(mut learner: impl Learner, rate: f64, rate_of: fn(&ModelUpdate) -> Option<f64>) {
-    learner.begin(0, observation(0)).expect("possible");
+    learner.start_episode(0, observation(0)).expect("possible");
     let mut rates = Vec::new();
     for step in 1..14 {
-        fly(&mut learner, step);
+        take_step(&mut learner, step);
         for update in learner.learn().expect("finite") {
             let expected = rate * (1.0 - step as f64 / 10.0).max(0.2);
             let got = rate_of(&update).expect("a step size");
@@ -292,14 +294,14 @@ fn a_neural_belief_continues_from_what_was_learned() {
     let filter = learned_filter();
     for filter in [None, Some(&filter)] {
         let mut learner = neural(None, filter, worlds()).expect("new");
-        learner.begin(0, observation(0)).expect("possible");
+        learner.start_episode(0, observation(0)).expect("possible");
         let bias = |contents: &Contents| contents.tensors["head.bias"].clone();
         let before = bias(&learner.contents().expect("whole"));
         let left = learn(&mut learner, 1..12);
         assert!(bias(&left) != before, "something was learned");
         let mut resumed = neural(Some(&left), None, worlds()).expect("its own");
         assert!(resumed.contents().expect("whole") == left);
-        resumed.begin(0, observation(12)).expect("possible");
+        resumed.start_episode(0, observation(12)).expect("possible");
         learn(&mut resumed, 13..16);
         assert_eq!((learner.n_updates(), resumed.n_updates()), (11, 14));
     }
@@ -308,7 +310,7 @@ fn a_neural_belief_continues_from_what_was_learned() {
 #[test]
 fn errors_name_what_does_not_fit_a_neural_belief() {
     let mut learner = neural(None, None, worlds()).expect("new");
-    learner.begin(0, observation(0)).expect("possible");
+    learner.start_episode(0, observation(0)).expect("possible");
     let left = learn(&mut learner, 1..5);
     let refused = |contents: &Contents, worlds: Worlds, words: &str| {
         let learner = neural(Some(contents), None, worlds).map(drop);

@@ -193,14 +193,14 @@ def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
 def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8] | None:
     """Checks paths; returns them as bytes, `(n_robots, n_moves)`, or None as `Lease.step` does."""
 
-class Server:
+class Connection:
     """A connection to a server, or worlds in this process. Calls of several threads take turns."""
 
     def __init__(self, instance: str, client: str, seconds: float) -> None:
         """Connects to a server; `client` names this program in the server's log."""
 
     @staticmethod
-    def embedded(settings: CheckedSettings, seed: int | None = None) -> Server:
+    def embedded(settings: CheckedSettings, seed: int | None = None) -> Connection:
         """Creates worlds in this process; `seed` replaces the first world's seed."""
 
     def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
@@ -253,7 +253,7 @@ class Options:
     def estimator(self) -> str:
         """Name of the estimator that computes the beliefs."""
 
-    def begin(self, worlds: list[int], seeds: list[int]) -> None:
+    def start_episodes(self, worlds: list[int], seeds: list[int]) -> None:
         """Starts episodes in `worlds` with these seeds; resets the beliefs about these worlds."""
 
     def take_over(self, world: int, kind: str, data: bytes) -> bool:
@@ -322,7 +322,7 @@ class Flights:
         If no move does, the whole row is 1.
         """
 
-    def begin(
+    def start_paths(
         self,
         begun: NDArray[np.bool_],
         robots: NDArray[np.int64],
@@ -345,7 +345,7 @@ class Flights:
 class Lease:
     """The right to fly consecutive robots, and the step k of each of their worlds."""
 
-    def __init__(self, server: Server, number: int, first_robot: int, n_robots: int) -> None: ...
+    def __init__(self, server: Connection, number: int, first_robot: int, n_robots: int) -> None: ...
     def step(
         self, paths: ArrayLike, first_robot: int, n_robots: int, flags: int, seconds: float
     ) -> Answer | None:
@@ -355,7 +355,7 @@ class Lease:
         `as_moves` converts or refuses them.
         """
 
-    def fly(
+    def send_paths(
         self,
         paths: ArrayLike,
         first_robot: int,
@@ -394,7 +394,7 @@ class Windows:
     ) -> Windows:
         """`side`: side in cells, odd; `n_of_world`: number of channels about the world."""
 
-    def begin(self, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None:
+    def start_paths(self, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None:
         """Begins paths in the rows `begun`, with channels `(n_begun, H, W, n_of_world)`."""
 
     def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None:

@@ -60,7 +60,7 @@ impl Episode {
                 _ => &flown.moves[r * n_moves..][..n_moves],
             };
             let coverage = flown.coverage(r);
-            robot.fly(&rules.airspace, path, coverage, &mut self.scratch);
+            robot.follow(&rules.airspace, path, coverage, &mut self.scratch);
         }
         self.world.advance();
         self.observe(rules);

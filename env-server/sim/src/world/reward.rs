@@ -71,7 +71,7 @@ mod tests {
                 let moves =
                     (0..n_moves).map(|t| Move::from_low_bits(draw(300 + 10 * r + t) as u64 >> 9));
                 let moves: Vec<Move> = moves.collect();
-                robot.fly(
+                robot.follow(
                     &rules.airspace,
                     &moves,
                     Coverage::Path,

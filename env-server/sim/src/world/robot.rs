@@ -39,12 +39,12 @@ impl Robot {
             visited: Vec::new(),
             seen: Vec::new(),
         };
-        robot.fly(airspace, &[], Coverage::Empty, &mut Scratch::default());
+        robot.follow(airspace, &[], Coverage::Empty, &mut Scratch::default());
         robot
     }
 
     /// Flies a path, or stays if the path is empty. The caller must then set the frame and the rewards.
-    pub(super) fn fly(
+    pub(super) fn follow(
         &mut self,
         airspace: &Airspace,
         path: &[Move],

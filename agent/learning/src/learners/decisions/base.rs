@@ -1,6 +1,6 @@
 //! The source of the beliefs that decisions are based on.
 
-use crate::learners::base::Beginning;
+use crate::learners::base::LearnerInputs;
 use anyhow::{Context, Result};
 use emberwatch_acting::beliefs::first_belief::first_belief;
 use emberwatch_acting::beliefs::{self, BeliefKind, Conditions};
@@ -55,7 +55,7 @@ impl Base {
     }
 
     /// Creates the base for `decisions.estimator`: a learned belief, or a filter with the server's model.
-    pub(super) fn of_settings(on: &Beginning<'_>) -> Result<Self> {
+    pub(super) fn of_settings(on: &LearnerInputs<'_>) -> Result<Self> {
         let (config, shape) = (on.config, on.worlds.shape());
         let kind = belief_of(&config.decisions.estimator)?;
         let mut known = None;

@@ -1,6 +1,6 @@
 //! A robot that flies options: its agent, and its unfinished transitions.
 
-use emberwatch_acting::rollout::Rollout;
+use emberwatch_acting::rollout::ActingAgent;
 use emberwatch_belief::planning::Proposal;
 use emberwatch_model::Move;
 use emberwatch_network::{Dqn, Track, Transition};
@@ -13,7 +13,7 @@ pub(super) struct Held {
 }
 
 pub(super) struct Run {
-    pub(super) rollout: Rollout,
+    pub(super) acting: ActingAgent,
     /// Features and reward of the last option, kept until the features of the next step complete the transition.
     pub(super) last: Option<(Vec<f32>, f32)>,
     pub(super) track: Track,
@@ -24,9 +24,9 @@ pub(super) struct Run {
 
 impl Run {
     /// Creates a run. The agent's belief must already be corrected with the first observation.
-    pub(super) fn begun(rollout: Rollout, dqn: &Dqn) -> Self {
+    pub(super) fn begun(acting: ActingAgent, dqn: &Dqn) -> Self {
         Self {
-            rollout,
+            acting,
             last: None,
             track: dqn.track(),
             held: Held::default(),
@@ -35,8 +35,8 @@ impl Run {
     }
 
     pub(super) fn propose(&mut self) -> Vec<Proposal> {
-        let cell = self.rollout.observation().robot.cell();
-        self.rollout.agent.propose(cell)
+        let cell = self.acting.observation().robot.cell();
+        self.acting.agent.propose(cell)
     }
 
     /// Returns the path of the chosen option.
@@ -44,14 +44,14 @@ impl Run {
         let next = self.next.take();
         let (option, proposal) = next.expect("invariant: an option was chosen");
         self.last = Some((proposal.features.to_vec(), 0.0));
-        self.rollout.agent.take_up(option, proposal).moves
+        self.acting.agent.take_up(option, proposal).moves
     }
 
     /// Adds the last step, which led to the given features of all options. Returns the transition that this step
     /// completes, if any.
     pub(super) fn led_to(&mut self, features: &[f32], dqn: &Dqn) -> Option<Transition> {
         let (input, reward) = self.last.take()?;
-        let is_terminated = self.rollout.observation().world.terminated != 0;
+        let is_terminated = self.acting.observation().world.terminated != 0;
         self.track.add(Transition {
             input,
             action: 0,

@@ -53,9 +53,10 @@ impl FilterFit {
     }
 
     /// Begins a new track for a robot.
-    pub fn begin(&mut self, robot: u32) {
-        self.replay.begin(robot);
-        self.neighbours.begin(robot, self.optimiser.shape.n_cells());
+    pub fn start_track(&mut self, robot: u32) {
+        self.replay.start_track(robot);
+        self.neighbours
+            .start_track(robot, self.optimiser.shape.n_cells());
     }
 
     /// Adds a robot's next frame. `predictor` is the belief before the frame (`None` for the track's first frame), and
@@ -208,7 +209,7 @@ mod tests {
 
     fn fit() -> FilterFit {
         let mut fit = FilterFit::new(DIMENSIONS, shape(), &config());
-        fit.begin(4);
+        fit.start_track(4);
         see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
         fit
     }
@@ -229,7 +230,7 @@ mod tests {
         assert_eq!(same.contents(), stored);
         assert_eq!(same.learned(), fit.learned());
         assert_eq!(same.replay.n_blocks(), 0);
-        same.begin(4);
+        same.start_track(4);
         see(&mut same, &[1, 0, 0, 1, 1]);
         assert!(same.n_updates() > fit.n_updates());
     }

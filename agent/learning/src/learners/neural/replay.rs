@@ -49,7 +49,7 @@ impl LessonReplay {
     }
 
     /// Begins a new track for a robot, without sightings.
-    pub fn begin(&mut self, robot: u32, shape: Shape) {
+    pub fn start_track(&mut self, robot: u32, shape: Shape) {
         self.open(robot, Sightings::new(shape));
     }
 
@@ -147,7 +147,7 @@ mod tests {
     /// Robots 3 and 4 observe the step number, each in a different cell.
     fn replay(n_steps: usize, max_frames: usize) -> LessonReplay {
         let mut replay = LessonReplay::new(max_frames);
-        (3..5).for_each(|robot| replay.begin(robot, shape()));
+        (3..5).for_each(|robot| replay.start_track(robot, shape()));
         for step in 0..n_steps {
             for robot in [3, 4] {
                 let mut frame = Frame::empty(shape());

@@ -221,7 +221,7 @@ def embed(**settings: str | float | bool | os.PathLike[str] | Model | None) -> C
 
 def embed_settings(settings: _native.CheckedSettings, seed: int | None = None) -> Client:
     """Does what `embed` does. `seed` is the first world's; None: the seed in the settings."""
-    return Client("(embedded)", embedded=_native.Server.embedded(settings, seed))
+    return Client("(embedded)", embedded=_native.Connection.embedded(settings, seed))
 
 
 def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:

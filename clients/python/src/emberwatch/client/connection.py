@@ -38,7 +38,7 @@ class Closable:
 class Connection(Closable):
     """A channel of JSON messages. Threads may share it; requests run one at a time."""
 
-    def __init__(self, instance: str, native: _native.Server) -> None:
+    def __init__(self, instance: str, native: _native.Connection) -> None:
         self.instance: Final = instance
         self._native: Any = native
 
@@ -61,10 +61,10 @@ class ServerConnection(Connection):
         instance: str = "default",
         *,
         timeout: float = STEP_TIMEOUT,
-        embedded: _native.Server | None = None,
+        embedded: _native.Connection | None = None,
     ) -> None:
         """Connects to a server, or to `embedded` worlds in this process."""
-        super().__init__(instance, embedded or _native.Server(instance, CLIENT, timeout))
+        super().__init__(instance, embedded or _native.Connection(instance, CLIENT, timeout))
         self.info: Final = record(ServerInfo, decoded("answer to 'hello'", self._native.info))
         self.shape: Final = self.info.shape
 

@@ -121,10 +121,10 @@ class Lease:
         self, paths: ArrayLike, first: int, n_robots: int, accepts_late: bool, timeout: float
     ) -> tuple[StepAnswer, int]:
         """Does what `fly` does, for `n_robots` robots of the lease from number `first` on."""
-        flown = self.native.fly(paths, first, n_robots, accepts_late, timeout)
+        flown = self.native.send_paths(paths, first, n_robots, accepts_late, timeout)
         if flown is None:
             moves = as_moves(paths, n_robots, self.client.info.n_moves)
-            flown = self.native.fly(moves, first, n_robots, accepts_late, timeout)
+            flown = self.native.send_paths(moves, first, n_robots, accepts_late, timeout)
             assert flown is not None
         return StepAnswer(flown[0]), flown[1]
 

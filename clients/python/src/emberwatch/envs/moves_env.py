@@ -142,7 +142,7 @@ class WildfireMovesEnv(WorldEnv):
         with self._session.turn:
             answer = self._begin(seed, options)
             if not self.continues:
-                self._observations.begin(ONE_ROW, answer.results, answer.frames)
+                self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
                 self._begin_path(answer)
             seen = self._seen(answer)
             self._session.finish()
@@ -197,7 +197,7 @@ class WildfireMovesEnv(WorldEnv):
         _, _, _, self._step, self._n_visited, self._start = answer.native.numbers(self._pays)
         self._seen_teams = self._teams(self._observations, answer)
         states = self._session.truth(answer) if self._session.settings.truth else None
-        self._flights.begin(ONE_ROW, self._start, states)
+        self._flights.start_paths(ONE_ROW, self._start, states)
 
     def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, self._step, self._n_visited)
@@ -268,7 +268,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         return as_choices(actions, self.num_envs, wire.N_MOVES)
 
-    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _step_worlds(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         completed = flown & self._flights.completes()
         if not completed.any():
             return self._move(actions, flown)
@@ -290,7 +290,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         return {**super()._reported(), "action_mask": self._flights.masks}
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
-        self._flights.begin(begun, super()._robots(), self._truths)
+        self._flights.start_paths(begun, super()._robots(), self._truths)
 
     def _robots(self) -> NDArray[np.int64]:
         return self._flights.robots

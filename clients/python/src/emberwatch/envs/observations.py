@@ -99,7 +99,7 @@ class Observations:
         """Omits the belief from copies, because their next episode begins with the prior."""
         return {**vars(self), "_belief": None}
 
-    def begin(
+    def start_episodes(
         self, begun: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
     ) -> None:
         """Begins the episodes of the rows `begun`, or joins them at their current step.
@@ -248,9 +248,9 @@ class Observations:
             self._image = image.astype(np.uint8)
         for name, windows in self._windows.items():
             if name == "recent" and self._last_seen is not None:
-                windows.begin(rows, self._last_seen.fading(rows))
+                windows.start_paths(rows, self._last_seen.fading(rows))
             elif self._belief is not None:
-                windows.begin(rows, of_belief(self._belief, rows))
+                windows.start_paths(rows, of_belief(self._belief, rows))
 
 
 def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:

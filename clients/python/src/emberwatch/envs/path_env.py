@@ -181,7 +181,7 @@ class WildfireEnv(WorldEnv):
             answer = self._begin(seed, options)
             self._answer = answer
             if not self.continues:
-                self._observations.begin(ONE_ROW, answer.results, answer.frames)
+                self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
             _, _, _, step, n_visited, cells = answer.native.numbers(self._pays)
             seen = self._seen(answer, step, n_visited, cells)
             self._session.finish()
@@ -276,6 +276,6 @@ class WildfireVectorEnv(WorldVectorEnv):
         chosen = moves(actions, self.num_envs, n_moves)
         return as_moves(actions, self.num_envs, n_moves) if chosen is None else chosen
 
-    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _step_worlds(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         self._exchange(actions, flown)
         return self._columns.rewards.copy()

@@ -68,7 +68,7 @@ class Plans:
         self.features = np.zeros((session.n_worlds, *shape), np.float32)
         self._paths = np.zeros((session.n_worlds, len(OBJECTIVES), 0), np.uint8)
 
-    def begin(
+    def start_episodes(
         self, begun: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
     ) -> None:
         """Begins or resumes the episodes of the worlds in `begun`.
@@ -84,7 +84,7 @@ class Plans:
             self._native = native = self._made(watched)
             self._watched = watched
         worlds = np.flatnonzero(begun).tolist()
-        native.begin(worlds, results["world"]["seed"][begun].tolist())
+        native.start_episodes(worlds, results["world"]["seed"][begun].tolist())
         known = [world for world in worlds if self._resumes(native, world, results[world])]
         if known:
             chosen = results[known].view(np.uint8)

@@ -171,7 +171,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             self._session.begin_step()
             flown = ~over if has_ended else self._every
             self._exchanged = None
-            rewards = self._fly(chosen, flown)
+            rewards = self._step_worlds(chosen, flown)
             self._elapsed += flown
             if has_ended:
                 rewards = np.where(flown, rewards, 0.0)
@@ -230,7 +230,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         raise NotImplementedError
 
-    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _step_worlds(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Steps the rows `flown`, and returns rewards; the values of other rows are ignored."""
         raise NotImplementedError
 
@@ -294,7 +294,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         begun = np.zeros(self.num_envs, np.bool_)
         begun[rows] = True
         begun &= moved
-        self._observations.begin(begun, self._results, self._frames)
+        self._observations.start_episodes(begun, self._results, self._frames)
         self._begin(begun)
         for row in np.flatnonzero(begun).tolist():
             self._paths[row] = None

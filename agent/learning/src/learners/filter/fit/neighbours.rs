@@ -41,7 +41,7 @@ impl Neighbours {
     }
 
     /// Begins an episode of a robot.
-    pub fn begin(&mut self, robot: u32, n_cells: usize) {
+    pub fn start_track(&mut self, robot: u32, n_cells: usize) {
         self.ages.insert(robot, Ages::new(n_cells));
     }
 

@@ -2,7 +2,7 @@
 
 use crate::client::view::view;
 use anyhow::Result;
-use emberwatch_acting::rollout::{Actor, Seen, StepRecord};
+use emberwatch_acting::rollout::{Actor, AgentObservation, StepRecord};
 use emberwatch_learning::learners::{Learner, LearnerKind};
 use emberwatch_protocol::Move;
 use emberwatch_protocol::client::{Backend, Client};
@@ -11,7 +11,7 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// A learner that acts, and whose beliefs are published to observers.
-pub struct Acting<'a> {
+pub struct ShownLearner<'a> {
     learner: &'a mut dyn Learner,
     kind: &'static LearnerKind,
     feed: &'a mut Feed,
@@ -22,7 +22,7 @@ pub struct Acting<'a> {
     pub planning: Duration,
 }
 
-impl<'a> Acting<'a> {
+impl<'a> ShownLearner<'a> {
     pub fn new(
         learner: &'a mut dyn Learner,
         kind: &'static LearnerKind,
@@ -44,15 +44,15 @@ impl<'a> Acting<'a> {
         let planning = self.planning / self.robots.len().max(1) as u32;
         for index in self.feed.due(self.robots.len()) {
             let number = self.robots.start + index as u32;
-            let rollout = self.learner.rollout(index);
-            let mut view = view(rollout, number / self.team, number..number + 1, planning);
+            let agent = self.learner.agent(index);
+            let mut view = view(agent, number / self.team, number..number + 1, planning);
             view.intent.policy = format!("train {}", self.kind.name);
             self.feed.show(&view);
         }
     }
 }
 
-impl Actor for Acting<'_> {
+impl Actor for ShownLearner<'_> {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         let paths = self.learner.plan();
@@ -60,7 +60,7 @@ impl Actor for Acting<'_> {
         paths
     }
 
-    fn see(&mut self, seen: Vec<Seen>) -> Result<Vec<StepRecord>> {
+    fn see(&mut self, seen: Vec<AgentObservation>) -> Result<Vec<StepRecord>> {
         let records = self.learner.see(seen)?;
         self.show();
         Ok(records)

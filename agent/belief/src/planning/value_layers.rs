@@ -38,7 +38,7 @@ impl Layer {
 
 /// The layers at one step, with sums over regions.
 #[derive(Debug, Clone)]
-pub struct Outlook {
+pub struct ValueLayers {
     airspace: Airspace,
     layers: [Grid<f32>; 4],
     sums: [Sums; 4],
@@ -52,7 +52,7 @@ pub struct Outlook {
 #[derive(Debug, Clone)]
 struct Sums(Grid<f64>);
 
-impl Outlook {
+impl ValueLayers {
     /// Computes the layers. `target` is the state with the highest reward.
     ///
     /// # Panics
@@ -74,7 +74,7 @@ impl Outlook {
         let surplus = probability.mapv(|p| (p - LIKELY).max(0.0));
         let entropy = belief.entropy(EntropyKind::Sum) / greatest;
         let layers = [probability, surplus, entropy, memory.novelty()];
-        let outlook = Self {
+        let layers = Self {
             airspace: airspace.clone(),
             sums: layers.each_ref().map(Sums::of),
             layers,
@@ -82,10 +82,10 @@ impl Outlook {
             recent: memory.recent,
         };
         let Some(no_fly) = airspace.no_fly() else {
-            return outlook;
+            return layers;
         };
         let closed = no_fly.iter().enumerate().filter(|(_, closed)| **closed);
-        outlook.cleared(&closed.map(|(cell, _)| cell).collect::<Vec<_>>(), &[])
+        layers.cleared(&closed.map(|(cell, _)| cell).collect::<Vec<_>>(), &[])
     }
 
     /// Sets layers to 0 in the cells that another robot visits. Layers that count in all cells in sight are set to 0 in
@@ -201,34 +201,34 @@ impl Sums {
 mod tests {
     use super::*;
 
-    fn outlook(height: usize, width: usize) -> Outlook {
+    fn layers(height: usize, width: usize) -> ValueLayers {
         let shape = Shape::new(height, width).expect("test shape");
         let random = |(row, col)| {
             (emberwatch_model::randomness::split_mix(row as u64, col as u64) % 3) as u8
         };
         let states = Grid::from_shape_fn((height, width), random);
         let belief = Belief::from_states(&states, 3).expect("valid states");
-        Outlook::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12)
+        ValueLayers::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12)
     }
 
     #[test]
     fn sums_around_a_cell_agree_with_plain_sums() {
         for (height, width) in [(1, 1), (3, 20), (20, 15), (64, 64)] {
-            let outlook = outlook(height, width);
-            let cells = |layer| outlook.layer(layer).indexed_iter();
-            for centre in outlook.centres().chain([outlook.shape().cell(0)]) {
+            let layers = layers(height, width);
+            let cells = |layer| layers.layer(layer).indexed_iter();
+            for centre in layers.centres().chain([layers.shape().cell(0)]) {
                 let near = |(row, col): (usize, usize)| {
                     row.abs_diff(centre.row) <= 6 && col.abs_diff(centre.col) <= 6
                 };
                 for layer in Layer::ALL {
                     let region = cells(layer).filter(|(at, _)| near(*at));
                     let expected: f32 = region.map(|(_, value)| value).sum();
-                    let got = outlook.around(layer, centre);
+                    let got = layers.around(layer, centre);
                     assert!((got - expected).abs() < 1e-3, "{centre}: {got} {expected}");
                 }
             }
             let total: f32 = cells(Layer::Probability).map(|(_, value)| value).sum();
-            assert!((outlook.total(Layer::Probability) - total).abs() < 1e-3);
+            assert!((layers.total(Layer::Probability) - total).abs() < 1e-3);
         }
     }
 
@@ -241,14 +241,14 @@ mod tests {
             states[[row, col]] = 2;
         }
         let belief = Belief::from_states(&states, 3).expect("valid states");
-        let outlook = Outlook::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12);
+        let layers = ValueLayers::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12);
         let robot = Cell { row: 2, col: 2 };
-        let best = |kept| outlook.best_region(Layer::Surplus, robot, kept);
+        let best = |kept| layers.best_region(Layer::Surplus, robot, kept);
         assert!(distance(best(1.0), Cell { row: 40, col: 50 }) <= 12);
         assert!(distance(best(0.5), Cell { row: 2, col: 20 }) <= 12);
-        assert_eq!(outlook.best_region(Layer::Entropy, robot, 1.0), robot);
+        assert_eq!(layers.best_region(Layer::Entropy, robot, 1.0), robot);
         let there = Cell { row: 40, col: 50 };
-        let left = outlook.without(&[40 * 64 + 50, 41 * 64 + 50]);
+        let left = layers.without(&[40 * 64 + 50, 41 * 64 + 50]);
         assert!(distance(left.best_region(Layer::Surplus, robot, 1.0), there) > 12);
     }
 }

@@ -4,7 +4,7 @@ use crate::acting::team::Team;
 use crate::benchmark::report::PolicyRun;
 use emberwatch_acting::beliefs::Input;
 use emberwatch_acting::policy::Policy;
-use emberwatch_acting::rollout::Rollout;
+use emberwatch_acting::rollout::ActingAgent;
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::scoring::Score;
 use emberwatch_belief::merit::{Found, MeritTally};
@@ -15,7 +15,7 @@ use emberwatch_protocol::path::Flight;
 use std::time::Duration;
 
 /// The measurements of one world's run, summed over its steps.
-pub struct WorldRun {
+pub struct RunTally {
     seed: u64,
     /// The state with the highest reward.
     target: usize,
@@ -36,7 +36,7 @@ pub struct WorldRun {
     merit: MeritTally,
 }
 
-impl WorldRun {
+impl RunTally {
     /// Starts the measurement of a world. `target` is the state with the highest reward.
     pub fn new(seed: u64, shape: Shape, target: usize) -> Self {
         Self {
@@ -59,38 +59,38 @@ impl WorldRun {
     /// Adds one agent's flights. After the last agent, updates the figures of merit.
     pub fn count(
         &mut self,
-        rollout: &Rollout,
+        acting: &ActingAgent,
         plans: &[Plan],
         planning: Duration,
         n_robots: usize,
     ) {
-        let airspace = rollout.agent.airspace();
-        for (result, plan) in rollout.results().zip(plans) {
+        let airspace = acting.agent.airspace();
+        for (result, plan) in acting.results().zip(plans) {
             self.flights.push(airspace.fly(result.start(), &plan.moves));
             self.n_visited_each += u64::from(result.n_visited);
         }
         self.planning += planning;
         if self.flights.len() == n_robots {
-            let result = &rollout.observation().world;
+            let result = &acting.observation().world;
             let found = Found {
                 n_hits: result.n_hits,
                 n_burning: result.n_target_cells,
             };
-            self.merit.update(&self.flights, found, rollout.truth());
+            self.merit.update(&self.flights, found, acting.truth());
             self.flights.clear();
         }
     }
 
     /// Adds a step's rewards, and the scores of the belief of the world's first agent.
-    pub fn score(&mut self, rollout: &Rollout, score: Option<Score>) {
-        let (agent, result) = (&rollout.agent, &rollout.observation().world);
+    pub fn score(&mut self, acting: &ActingAgent, score: Option<Score>) {
+        let (agent, result) = (&acting.agent, &acting.observation().world);
         self.rewards.push(result.reward as f32);
         self.fire_cells.push(result.n_target_cells as f32);
         self.reward += result.reward;
         self.n_visited += u64::from(result.n_visited);
         self.n_hits += u64::from(result.n_hits);
         let brier = |truth| brier_score(agent.belief(), truth, self.target, agent.target());
-        let brier = rollout.truth().map(brier);
+        let brier = acting.truth().map(brier);
         self.brier = brier.map(|brier| self.brier.unwrap_or_default() + brier);
         self.score += score.unwrap_or_default();
     }

@@ -5,7 +5,7 @@ use crate::acting::team::Team;
 use crate::client::worlds::Worlds;
 use anyhow::{Context, Result, ensure};
 use emberwatch_acting::policy::Policy;
-use emberwatch_acting::rollout::{Environment, Seen};
+use emberwatch_acting::rollout::{AgentObservation, Environment};
 use emberwatch_protocol::client::{Backend, Claim, Client, Observation};
 use emberwatch_protocol::control::{ServerInfo, WorldSeed};
 use emberwatch_protocol::feed::Feed;
@@ -21,7 +21,7 @@ pub const MAX_BATCH: u32 = 32;
 const LEASE: Duration = Duration::from_secs(3600);
 
 /// Worlds on which policies are compared.
-pub struct Arena {
+pub struct ComparedWorlds {
     client: Client<Worlds>,
     /// The worlds' model. For recorded worlds, a model whose states never change.
     pub model: Model,
@@ -30,14 +30,14 @@ pub struct Arena {
     /// Number of worlds, which is the number of seeds that run at a time.
     pub n_worlds: u32,
     /// Number of robots per agent: one, or all robots of a world.
-    crew: usize,
+    robots_per_agent: usize,
     /// Seeds of the running worlds.
     seeds: Vec<u64>,
     /// Number of steps since the reset.
     step: u64,
 }
 
-impl Arena {
+impl ComparedWorlds {
     /// Acquires up to `n_seeds` worlds.
     pub fn open(worlds: Worlds, n_seeds: u32) -> Result<Self> {
         let (n_worlds, team) = (worlds.info().n_worlds, worlds.info().n_robots);
@@ -63,7 +63,7 @@ impl Arena {
             model,
             known: None,
             n_worlds,
-            crew: 1,
+            robots_per_agent: 1,
             seeds: Vec::new(),
             step: 0,
         })
@@ -111,8 +111,8 @@ impl Arena {
     }
 
     /// Sets the kind of team for the following flights.
-    pub fn fly_as(&mut self, team: Team) {
-        self.crew = match team {
+    pub fn set_team(&mut self, team: Team) {
+        self.robots_per_agent = match team {
             Team::Joint | Team::Oracle => self.n_robots(),
             Team::Alone | Team::Shared => 1,
         };
@@ -121,11 +121,11 @@ impl Arena {
     }
 
     pub fn n_agents(&self) -> usize {
-        self.n_robots() / self.crew
+        self.n_robots() / self.robots_per_agent
     }
 
     /// Starts worlds with these seeds; returns what agents see at k = 0, by world.
-    pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>> {
+    pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<AgentObservation>> {
         (self.seeds, self.step) = (seeds.to_vec(), 0);
         let order = |(world, &seed)| WorldSeed {
             world,
@@ -151,21 +151,21 @@ impl Arena {
     }
 
     /// Returns what agents see at the present step, with the hidden states if they can be read.
-    fn seen(&mut self, observations: Vec<Observation>) -> Result<Vec<Seen>> {
+    fn seen(&mut self, observations: Vec<Observation>) -> Result<Vec<AgentObservation>> {
         let n_worlds = self.seeds.len();
         let truth = self.client.backend().states(&self.seeds, self.step)?;
         let mut observations = observations.into_iter();
         let agents = (0..n_worlds).flat_map(|world| vec![world; self.n_agents()]);
-        let seen = agents.map(|world| Seen {
+        let seen = agents.map(|world| AgentObservation {
             truth: truth.as_ref().map(|states| states[world].clone()),
-            ..Seen::new(observations.by_ref().take(self.crew))
+            ..AgentObservation::new(observations.by_ref().take(self.robots_per_agent))
         });
         Ok(seen.collect())
     }
 }
 
-impl Environment for Arena {
-    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<Seen>>> {
+impl Environment for ComparedWorlds {
+    fn step(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<AgentObservation>>> {
         self.step += 1;
         let observations = self.client.step(self.robots(), paths)?;
         self.seen(observations).map(Some)
