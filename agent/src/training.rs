@@ -12,6 +12,7 @@ mod spec;
 pub use self::spec::{CHECKPOINT, TrainingSpec};
 
 use self::shown_learner::ShownLearner;
+use crate::client::info::{warn_of_other_worlds, world_names};
 use crate::client::worlds::Worlds;
 use crate::training::metrics::{METRICS, Metrics, Tick};
 use crate::training::seconds::Stopwatch;
@@ -205,6 +206,7 @@ impl<'a> TrainingLoop<'a> {
         let contents = self.learner.contents();
         let mut contents = contents.map_err(|error| spec.stopped(error, &*self.learner))?;
         contents.settings = toml::to_string(&spec.config)?;
+        contents.worlds = world_names(self.client.info());
         let place = spec.out.join(CHECKPOINT);
         checkpoint::write(&place, self.kind.checkpoint, &contents)?;
         self.stopwatch.write()?;
@@ -260,6 +262,7 @@ fn new_learner(
     contents: Option<&Contents>,
 ) -> Result<Box<dyn Learner>> {
     let info = client.info();
+    warn_of_other_worlds(&spec.learned, info);
     let worlds = learners::Worlds {
         airspace: info.airspace().map_err(anyhow::Error::msg)?,
         n_observations: info.n_observations,

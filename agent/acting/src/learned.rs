@@ -1,13 +1,52 @@
 //! Learned values, loaded from checkpoints: at most one value of each type.
 
+use emberwatch_model::Model;
+use serde::{Deserialize, Serialize};
 use std::any::Any;
-use std::fmt::Debug;
+use std::fmt::{self, Debug};
 use std::sync::Arc;
 
 /// Values from checkpoints, for the beliefs and goals that use them. Clones share the values.
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     values: Vec<Arc<dyn Value>>,
+    /// The worlds of each checkpoint.
+    worlds: Vec<WorldNames>,
+}
+
+/// What worlds are called, to tell whether a checkpoint is used in worlds like those in which it was learned.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorldNames {
+    /// Name of the model. `None` if the server hides it.
+    pub model: Option<String>,
+    /// Names of the observations. Empty if unknown.
+    pub observations: Vec<String>,
+}
+
+impl WorldNames {
+    /// Returns the names of a model's worlds.
+    pub fn of(model: &Model) -> Self {
+        Self {
+            model: Some(model.name().into()),
+            observations: model.observation_names(),
+        }
+    }
+
+    /// Returns whether names that both sides know differ.
+    fn differ(&self, other: &Self) -> bool {
+        let models = self.model.as_ref().zip(other.model.as_ref());
+        let is_known = !self.observations.is_empty() && !other.observations.is_empty();
+        models.is_some_and(|(own, other)| own != other)
+            || is_known && self.observations != other.observations
+    }
+}
+
+impl fmt::Display for WorldNames {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let model = self.model.as_deref().unwrap_or("a hidden model");
+        let observations = self.observations.join(", ");
+        write!(formatter, "{model} (observations {observations})")
+    }
 }
 
 trait Value: Any + Debug + Send + Sync {}
@@ -33,6 +72,19 @@ impl Learned {
         })
     }
 
+    /// Records the worlds in which a checkpoint was learned.
+    pub fn add_worlds(&mut self, worlds: WorldNames) {
+        self.worlds.push(worlds);
+    }
+
+    /// Returns a warning if a checkpoint was learned in worlds of another name than these.
+    pub fn warning_in(&self, worlds: &WorldNames) -> Option<String> {
+        let other = self.worlds.iter().find(|own| own.differ(worlds))?;
+        Some(format!(
+            "checkpoint: expected one learned in worlds of {worlds}, got one learned in worlds of {other}"
+        ))
+    }
+
     /// Stores a value, and drops any earlier value of the same type. Returns whether the dropped value was different.
     pub fn put<T: Any + Debug + Send + Sync + PartialEq>(&mut self, value: T) -> bool {
         let is_other = self.get::<T>().is_some_and(|before| *before != value);
@@ -48,6 +100,29 @@ impl Learned {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn worlds_of_another_model_or_with_other_observations_are_named_in_a_warning() {
+        let names = |model: &str| WorldNames::of(&Model::built_in(model).expect("built in"));
+        let hidden = |model| WorldNames {
+            model: None,
+            ..names(model)
+        };
+        let mut learned = Learned::default();
+        learned.add_worlds(names("wildfire"));
+        let warned = |worlds: &WorldNames| learned.warning_in(worlds);
+        for same in [names("wildfire"), hidden("wildfire"), WorldNames::default()] {
+            assert_eq!(warned(&same), None, "{same}");
+        }
+        let text = warned(&names("wildfire-latent")).expect("another model");
+        assert_eq!(
+            text,
+            "checkpoint: expected one learned in worlds of wildfire-latent (observations normal, latent, fire), \
+             got one learned in worlds of wildfire (observations normal, latent, fire)"
+        );
+        assert!(warned(&hidden("road-ice")).is_some(), "other observations");
+        assert_eq!(warned(&hidden("wildfire-latent")), None, "a hidden model");
+    }
 
     #[test]
     fn each_type_has_one_value() {

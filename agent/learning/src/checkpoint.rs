@@ -10,6 +10,7 @@ use crate::file::replace_file;
 use anyhow::{Context, Result, anyhow, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use emberwatch_acting::config::AgentConfig;
+use emberwatch_acting::learned::WorldNames;
 use emberwatch_model::text::shortened;
 use emberwatch_network::NamedTensor;
 use safetensors::tensor::TensorView;
@@ -28,6 +29,7 @@ const KIND: &str = "emberwatch.kind";
 const FORMAT: &str = "emberwatch.format";
 const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
+const WORLDS: &str = "worlds";
 
 /// Name of the byte tensor.
 const STATE: &str = "state";
@@ -68,10 +70,12 @@ pub struct Contents {
     pub tensors: BTreeMap<String, Tensor>,
     pub state: Vec<u8>,
     pub settings: String,
+    /// The worlds in which the training ran.
+    pub worlds: WorldNames,
 }
 
 impl Contents {
-    /// Creates contents from tensors and a state. The settings are empty.
+    /// Creates contents from tensors and a state. The settings are empty, the worlds unknown.
     pub fn new(tensors: impl IntoIterator<Item = NamedTensor>, state: &impl Serialize) -> Self {
         let tensors = tensors.into_iter();
         let tensor = |(name, shape, numbers)| (name, Tensor { shape, numbers });
@@ -79,6 +83,7 @@ impl Contents {
             tensors: tensors.map(tensor).collect(),
             state: Vec::new(),
             settings: String::new(),
+            worlds: WorldNames::default(),
         };
         contents.set_state(state);
         contents
@@ -143,6 +148,14 @@ impl Contents {
         config.map_err(|error| wrong(SETTINGS, "the settings of an agent", error))
     }
 
+    /// Returns the worlds as JSON, or nothing if they are unknown.
+    fn worlds_text(&self) -> String {
+        if self.worlds == WorldNames::default() {
+            return String::new();
+        }
+        serde_json::to_string(&self.worlds).expect("invariant: names can be encoded")
+    }
+
     /// Returns a checksum of all contents. It reveals accidental damage, but not manipulation.
     pub fn digest(&self) -> String {
         let mut digest = crc32fast::Hasher::new();
@@ -152,6 +165,7 @@ impl Contents {
         }
         digest.update(&self.state);
         digest.update(self.settings.as_bytes());
+        digest.update(self.worlds_text().as_bytes());
         format!("{:08x}", digest.finalize())
     }
 }
@@ -235,6 +249,7 @@ pub fn encode(kind: &str, contents: &Contents) -> Result<Vec<u8>> {
         (FORMAT, VERSION),
         (DIGEST, &contents.digest()),
         (SETTINGS, &contents.settings),
+        (WORLDS, &contents.worlds_text()),
     ];
     let texts = texts.map(|(name, text)| (name.into(), text.into()));
     let mut bytes = safetensors::serialize(views, Some(HashMap::from(texts))).map_err(damaged)?;
@@ -271,6 +286,10 @@ pub fn decode(bytes: &[u8]) -> Result<(String, Contents)> {
     );
     let mut contents = Contents::new([], &());
     contents.settings = texts.remove(SETTINGS).unwrap_or_default();
+    if let Some(worlds) = texts.remove(WORLDS).filter(|text| !text.is_empty()) {
+        let worlds = serde_json::from_str(&worlds);
+        contents.worlds = worlds.map_err(|error| wrong(WORLDS, "names of worlds", error))?;
+    }
     for (name, view) in file.iter() {
         match (name, view.dtype()) {
             (STATE, Dtype::U8) => contents.state = view.data().to_vec(),

@@ -5,7 +5,7 @@ use crate::acting::link::Link;
 use crate::acting::mission::{Mission, info_of, model_of, needs_model, recorded_states};
 use crate::acting::team::Team;
 use crate::client::errors::is_late;
-use crate::client::info::{connect, is_belief_left};
+use crate::client::info::{connect, is_belief_left, warn_of_other_worlds};
 use crate::client::view::view;
 use anyhow::{Result, ensure};
 use emberwatch_acting::beliefs::first_belief::first_belief;
@@ -68,6 +68,7 @@ impl Pilot {
         let policy = Policy::named(&mission.policy, &model)?;
         // An agent that cannot act must not take robots over from an agent that can.
         check(mission, &info, (&model, &policy), is_recorded)?;
+        warn_of_other_worlds(&mission.learned, &info);
         // Simulating the prior can take long, so it happens before the lease begins. The simulation is skipped if a
         // former agent left a belief.
         let any = Belief::from_initial(&model, info.shape()?);

@@ -5,6 +5,7 @@ use crate::benchmark::compared_worlds::ComparedWorlds;
 use crate::benchmark::report::PolicyRun;
 use crate::benchmark::report::common_worlds::World;
 use crate::benchmark::run_tally::RunTally;
+use crate::client::info::warn_of_other_worlds;
 use crate::client::view::view;
 use anyhow::{Context, Result, ensure};
 use emberwatch_acting::beliefs::first_belief::first_belief;
@@ -60,6 +61,7 @@ pub fn compare(
     let prior = config.prior(worlds.info().burn_in);
     let prior = first_belief(prior, worlds.known_model(), worlds.shape(), config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
+    warn_of_other_worlds(&comparison.learned, worlds.info());
     let mut results = Results::default();
     let mut feed = worlds.feed(prior.probabilities());
     let entries = comparison.entries(&worlds.model);

@@ -1,11 +1,14 @@
 //! Connections of this program, and requests that need no lease.
 
 use crate::client::errors::is_away;
-use emberwatch_protocol::Connection;
+use emberwatch_acting::learned::{Learned, WorldNames};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::STEP_TIMEOUT;
 use emberwatch_protocol::connection::{ConnectionError, unexpected};
-use emberwatch_protocol::control::{Reply, Request};
+use emberwatch_protocol::control::{Reply, Request, ServerInfo};
+use emberwatch_protocol::model::Description;
+use emberwatch_protocol::task::Task;
+use emberwatch_protocol::{Connection, Model};
 use std::time::{Duration, Instant};
 
 /// Time between two attempts to reach an absent server.
@@ -53,5 +56,32 @@ pub fn is_belief_left(
         Ok(other) => Err(unexpected("belief", &other)),
         Err(ConnectionError::Refused { .. }) => Ok(false),
         Err(error) => Err(error),
+    }
+}
+
+/// Returns what the worlds of a server are called. Of a task's worlds, the model's name is known even if the server
+/// hides the model. Recorded worlds are called as their description.
+pub fn world_names(info: &ServerInfo) -> WorldNames {
+    let revealed = match &info.recorded_world {
+        Some(recorded) => recorded.description.as_deref().map(Description::model_of),
+        None => info.model.as_deref().map(Model::from_toml),
+    };
+    let task = info
+        .task
+        .as_deref()
+        .filter(|_| info.recorded_world.is_none());
+    let task = || task.and_then(|name| Task::named(name).ok());
+    let of_task = || task().map(|task| task.world.model);
+    let revealed = revealed.and_then(Result::ok).map(|it| it.name().into());
+    WorldNames {
+        model: revealed.or_else(|| of_task().filter(|name| Model::built_in(name).is_some())),
+        observations: info.observations.clone(),
+    }
+}
+
+/// Warns if a checkpoint was learned in other worlds than a server has.
+pub fn warn_of_other_worlds(learned: &Learned, info: &ServerInfo) {
+    if let Some(warning) = learned.warning_in(&world_names(info)) {
+        tracing::warn!("{warning}");
     }
 }

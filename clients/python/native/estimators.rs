@@ -1,12 +1,13 @@
 //! The agent's estimators for Python: beliefs of one kind about `n` worlds, which are corrected with frames.
 
 use crate::detached::detached;
+use crate::errors::warn;
 use crate::model::{model_of, shape_of};
 use crate::origin::{Origin, checkpoint_bytes, decoded, kind_of, no_prior, unfit};
 use crate::refusal::{failed, invalid, refused};
 use crate::threads::{Pool, Threads};
 use emberwatch_acting::beliefs::WorldForm;
-use emberwatch_acting::learned::Learned;
+use emberwatch_acting::learned::{Learned, WorldNames};
 use emberwatch_acting::options::usual;
 use emberwatch_belief::brier::{accuracy, brier_score, log_loss};
 use emberwatch_belief::estimation::SpatialFilter;
@@ -111,6 +112,10 @@ impl Estimators {
         if kind.learned_by.is_none() {
             let got = format!("decisions on the belief '{}': use known(model)", kind.name);
             return Err(invalid(py, "checkpoint", "a learned belief", got));
+        }
+        let names = model.as_ref().map(WorldNames::of);
+        if let Some(warning) = names.and_then(|names| learned.warning_in(&names)) {
+            warn(py, warning)?;
         }
         let form = model.as_ref().map(|model| WorldForm::of(model, shape));
         let fits = form.map_or(Ok(()), |form| kind.check(&learned, &form));

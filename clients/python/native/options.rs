@@ -2,6 +2,7 @@
 
 use crate::airspace::Given;
 use crate::connection::checked;
+use crate::errors::warn;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
 use crate::origin::decoded;
@@ -11,7 +12,7 @@ use crate::prior::first_belief;
 use crate::refusal::{invalid, refused};
 use emberwatch_acting::beliefs::{self, BeliefKind};
 use emberwatch_acting::config::{AgentConfig, PriorKind};
-use emberwatch_acting::learned::Learned;
+use emberwatch_acting::learned::{Learned, WorldNames};
 use emberwatch_acting::options::{OptionSetup, usual};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Prior;
@@ -94,6 +95,11 @@ impl Options {
         let shape = shape_of(py, spec.height, spec.width)?;
         let kind_of_belief = estimator.unwrap_or_else(|| usual(&learned));
         let model = model(py, &spec, kind_of_belief)?;
+        let is_known = spec.model.is_some() || spec.description.is_some();
+        let names = is_known.then(|| WorldNames::of(&model));
+        if let Some(warning) = names.and_then(|names| learned.warning_in(&names)) {
+            warn(py, warning)?;
+        }
         let setup = OptionSetup::new(estimator, learned, model, shape, spec.n_moves);
         let setup = setup.map_err(|error| refused(py, format!("{error:#}")))?;
         let config = AgentConfig {

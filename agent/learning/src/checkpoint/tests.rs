@@ -1,4 +1,5 @@
 use super::*;
+use emberwatch_model::Model;
 use std::path::PathBuf;
 
 type State = (Vec<u64>, Option<String>);
@@ -11,6 +12,7 @@ fn contents() -> Contents {
     let kernel = ("kernel".into(), vec![2, 2], vec![1.0, -0.5, 0.0, 3e-9]);
     let mut contents = Contents::new([kernel], &state());
     contents.settings = "seed = 3".into();
+    contents.worlds = WorldNames::of(&Model::wildfire());
     contents
 }
 

@@ -103,7 +103,7 @@ impl FilterLearner {
         })
     }
 
-    /// Creates a robot's acting, whose belief has not been corrected yet.
+    /// Creates a robot's agent, whose belief has not been corrected yet.
     fn agent_at(&self, observation: Observation) -> ActingAgent {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));

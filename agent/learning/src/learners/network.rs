@@ -97,7 +97,7 @@ pub struct NetworkLearner {
     /// The latest steps, whose transitions are not yet in the DQN's replay buffer.
     track: Track,
     choices: Vec<Policy>,
-    /// The acting, once attached to a world.
+    /// The agent, once attached to a world.
     acting: Option<ActingAgent>,
     /// The last decision, with its path.
     decision: Option<Decision>,

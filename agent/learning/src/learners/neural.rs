@@ -113,7 +113,7 @@ impl NeuralLearner {
         self.reward.target().unwrap_or(last)
     }
 
-    /// Creates a robot's acting, whose belief has not been corrected yet.
+    /// Creates a robot's agent, whose belief has not been corrected yet.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let filter = self.filter.as_deref();
         let estimator = estimator(&self.network, filter, self.worlds.shape())?;
