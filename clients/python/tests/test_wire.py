@@ -65,7 +65,7 @@ class Wire:
 class Wired:
     def __init__(self, **hello: Any) -> None:
         self.wire = Wire(HELLO | SIZES | hello)
-        with patch.object(emberwatch.client.connection._native, "Server", lambda *_: self.wire):
+        with patch.object(emberwatch.client.connection._native, "Connection", lambda *_: self.wire):
             self.client = Client("nowhere")
         notes = SimpleNamespace(note=lambda *_: None)
         self.client.lease = lambda *_: notes

@@ -90,7 +90,7 @@ class Observations:
             if name in channels
         }
         #: Whether the last frame alone determines the observation.
-        self._has_no_memory = not (OF_BELIEF | _OF_MEMORY) & set(names)
+        self._has_no_memory = not has_memory(names)
         self._image = np.empty(0, np.uint8)
         # One row for each observed value, and a last row for unobserved cells.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
@@ -261,6 +261,11 @@ def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:
 def cells_of(robots: NDArray[np.void]) -> NDArray[np.int64]:
     """Returns row and column of each robot as a new array."""
     return np.stack((robots["row"], robots["col"]), axis=1).astype(np.int64)
+
+
+def has_memory(parts: str | Sequence[str]) -> bool:
+    """Whether an observation of these parts depends on frames before the last one."""
+    return bool((OF_BELIEF | _OF_MEMORY) & set(names_of(parts)))
 
 
 def names_of(parts: object) -> tuple[str, ...]:

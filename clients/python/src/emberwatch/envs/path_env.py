@@ -12,7 +12,7 @@ from emberwatch.client import wire
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_moves
 from emberwatch.envs.base import ONE_ROW, Reward, WorldEnv, check_reward
-from emberwatch.envs.observations import Observations, Parts
+from emberwatch.envs.observations import Observations, Parts, has_memory
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
@@ -261,7 +261,7 @@ class WildfireVectorEnv(WorldVectorEnv):
         """See the class."""
         pays = check_reward(reward)
         settings = Settings.of(WildfireVectorEnv, world)
-        session = vector_session(settings, num_envs)
+        session = vector_session(settings, num_envs, rebuilds_memory=has_memory(observation))
         super().__init__(
             session,
             Observations(observation, session, kind=kind),

@@ -91,6 +91,8 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
+    #: Number of steps whose frames worlds in this process keep; None: the default.
+    history: int | None = None
     #: Whether infos and pictures show the hidden states. Even if False, `truth` may be set, for
     #: rewards that need the hidden states.
     reveals: bool = False
@@ -135,7 +137,8 @@ class Settings:
     def read(self) -> _native.CheckedSettings:
         """Checks the settings of one world, and reads their files. Errors name keywords."""
         with _names_keywords():
-            return read_settings({"task": self.task, "publish_truth": self.truth, **self.worlds})
+            own = {"task": self.task, "publish_truth": self.truth, "history": self.history}
+            return read_settings({**own, **self.worlds})
 
 
 def _checked(keyword: str, value: Any, limits: tuple[int, int] | None) -> Any:

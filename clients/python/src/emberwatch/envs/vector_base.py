@@ -5,6 +5,7 @@ of a world begin and end their episodes together.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -88,7 +89,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self.observation_space = batch_space(observations.space, num_envs)
         self.single_action_space = action_space
         self.action_space = batch_space(action_space, num_envs)
-        self._generators: list[np.random.Generator | None] = [None] * session.n_worlds
+        #: The generator of each world's seeds, with its own seed; None before the first reset.
+        self._generators: list[tuple[np.random.Generator, int] | None] = [None] * session.n_worlds
         self._pays = pays
         self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
@@ -274,13 +276,24 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         n_robots = self._spec.n_robots
         worlds, chosen = [row // n_robots for row in rows[::n_robots]], list[int]()
         for world in worlds:
-            seed, generator = seeds[world], self._generators[world]
-            if seed is not None or generator is None:
-                generator, _ = seeding.np_random(seed)
-                self._generators[world] = generator
+            seed = seeds[world]
+            generator, _ = self._generator(world, seed)
             chosen.append(draw_seed(generator) if seed is None else seed)
         self._take(self._session.reset(worlds, chosen))
         self._reset_episodes(rows, self._every)
+
+    def _generator(self, world: int, seed: int | None) -> tuple[np.random.Generator, int]:
+        """Returns the generator of a world's seeds; begins it anew with a seed."""
+        generator = self._generators[world]
+        if seed is not None or generator is None:
+            generator = self._generators[world] = seeding.np_random(seed)
+        return generator
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seed of each row's world in its last reset with a seed, as from `SyncVectorEnv`."""
+        worlds = np.arange(self.num_envs) // self._spec.n_robots
+        return tuple(self._generator(world, None)[1] for world in worlds.tolist())
 
     def _reset_episodes(self, rows: list[int], moved: NDArray[np.bool_]) -> None:
         """Begins or resumes the episodes of some rows.
@@ -419,10 +432,18 @@ def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
     }
 
 
-def vector_session(settings: Settings, num_envs: int | None) -> Session:
-    """Makes a session of all robots of some worlds."""
+def vector_session(
+    settings: Settings, num_envs: int | None, *, rebuilds_memory: bool = True
+) -> Session:
+    """Makes a session of all robots of some worlds.
+
+    `rebuilds_memory`: whether a reset with `resume` needs earlier frames. Otherwise, worlds in this
+    process keep only the last frame.
+    """
     if settings.robot is not None:
         raise invalid("robot", "None, as a vector environment flies all robots", settings.robot)
+    if settings.instance is None and not rebuilds_memory:
+        settings = replace(settings, history=1)
     return Session(settings, num_envs)
 
 
