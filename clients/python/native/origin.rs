@@ -15,6 +15,9 @@ use pyo3::prelude::*;
 use std::borrow::Cow;
 use std::path::PathBuf;
 
+/// Memory of the tables of a small model, in bytes.
+const TABLE_BYTES: usize = 4096;
+
 /// The kind and the sources of beliefs.
 pub struct Origin {
     pub kind: &'static BeliefKind,
@@ -81,12 +84,10 @@ impl Origin {
             let expected = format!("a belief on {expected}");
             return Err(invalid(py, "checkpoint", expected, got));
         }
-        let saved = self
-            .kind
-            .traits
-            .handover
-            .map_or(0, |it| it(&*first).to_bytes().len());
-        memory(8 * size_of_val(first.belief().as_slice()) + 2 * saved)?;
+        let saved = self.kind.traits.handover;
+        let saved = saved.map_or(0, |it| it(&*first).to_bytes().len());
+        let belief = size_of_val(first.belief().as_slice());
+        memory(TABLE_BYTES + 8 * belief + 2 * saved)?;
         let others = py.detach(|| {
             threads.work(self.is_short(n_worlds), |threads| {
                 threads.each(1..n_worlds, |_| self.estimator())
