@@ -173,6 +173,7 @@ fn a_land_that_cannot_be_is_refused_and_pockets_are_told_of() {
     let share = "no-fly cells cut off 2 of 53 free cells (3.77 %)";
     let random = run(SERVER, &format!("--check {land} --start random")).check(0);
     random.check_says(share).check_prints("start = \"random\"");
+    random.check_says("model \"land\": 3 states, 3 transitions, maps 7 x 9");
     assert!(!random.stderr.contains("WARN"), "{}", random.stderr);
     let closed_in = run(SERVER, &format!("--check {land} --start 1,2")).check(0);
     closed_in.check_says(share).check_says(

@@ -84,28 +84,54 @@ def test_crossing_edges_are_repaired_and_times_may_be_numbers(
     file = perimeters(tmp_path / "d.shp", SQUARES, DateCur=slashes, number=number)
     assert len(world(file)) == 3
     assert len(world(file, "--time-column=number", "--unit=ms")) == 2
+    assert "from 1599264000000 ms to 1599350400000 ms, in 2 of 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flags", "words", "quiet"),
+    [
+        ("--step=1d", "in 3 of 3 steps", None),
+        ("--step=6h", "in 3 of 9 steps", "1 to 3, 5 to 7"),
+        ("--step=6h --burning=4", "in 3 of 9 steps", None),
+        ("--step=30 d", "in 2 of 2 steps", None),
+        ("--begin=1598551200", "in 3 of 5 steps", "0 to 1"),
+    ],
+)
+def test_times_and_steps_without_fire_are_reported(
+    flags: str, words: str, quiet: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world(perimeters(tmp_path / "fire.gpkg", SQUARES), *flags.replace(" --", "|--").split("|"))
+    told = capsys.readouterr().out
+    times = "at 3 times from 2020-08-29 18:00:00 UTC to 2020-08-31 18:00:00 UTC"
+    assert f"cells begin to burn {times}, {words}\n" in told
+    assert told.count("warning: ") == (quiet is not None)
+    assert quiet is None or f"\nwarning: no cell burns in steps {quiet}\n" in told
 
 
 #: Words of the error, shapes, and columns.
 REFUSED: list[tuple[str, list[Any], dict[str, Any]]] = [
-    ("expected a polygon in each row, got Point in row 1", [SQUARES[0], Point(WEST, SOUTH)], {}),
+    ("a polygon in each row, got Point in row 1; for detections, use the CSV file of FIRMS",
+        [SQUARES[0], Point(WEST, SOUTH)], {}),
     ("a polygon in each row, got LineString in row 0", [LineString([(0, 0), (1, 1)])], {}),
     ("a polygon in each row, got none in row 0", [None, SQUARES[0]], {}),
     ("expected a coordinate reference system, got none; set it", SQUARES, {"crs": None}),
-    ("expected one column of times such as 2020-08-31T12:00:00Z, got 0 (name); choose with --time-",
+    ("expected one column of times such as 2020-08-31T12:00:00Z, got 0 (name); add one",
         SQUARES, {"name": ["a", "b", "c"]}),
+    ("got 0 (number); choose with --time-column", SQUARES, {"number": [1, 2, 3]}),
     ("got 2 (made, seen); choose with --time-column", SQUARES, {"made": DAYS, "seen": DAYS}),
     ("seen: expected times such as 2020-08-31T12:00:00Z in each row, got '' in row 1", SQUARES,
         {"seen": [DAYS[0], None, DAYS[2]]}),
-    ("seen: expected times such as 2020-08-31T12:00:00Z in each row, got '31-08-2020' in row 1",
-        SQUARES, {"seen": [DAYS[0], "31-08-2020", DAYS[2]]}),
+    ("seen: expected times such as 2020-08-31T12:00:00Z in each row, got '08/31/2020' in row 1",
+        SQUARES, {"seen": [DAYS[0], "08/31/2020", DAYS[2]]}),
     ("expected times that all have a zone, or none, got '2020-08-29T18:00:00Z' and '2020-08-30",
         SQUARES, {"date": [DAYS[0], "2020-08-30 18:00:00", DAYS[2]]}),
-    ("expected at least 2 steps, got 1", SQUARES[:1], {}),
+    ("expected at least 2 steps, got 1: ", SQUARES[:1], {}),
     ("centres of cells in perimeters, got none in the first perimeters; use a smaller --cell",
         [box(WEST + 1, SOUTH + 1, WEST + 9, SOUTH + 9), SQUARES[0]], {}),
     ("perimeters on at most 268435456 cells, got", [SQUARES[0], box(0, 0, 9e6, 9e6)], {}),
-    ("expected shapes in a zone of UTM", [box(0, 89, 1, 95)], {"crs": "EPSG:4326"}),
+    ("expected degrees in a zone of UTM, got coordinates from [0.0, 89.0] to [1.0, 95.0]; if these",
+        [box(0, 89, 1, 95)], {"crs": "EPSG:4326"}),
+    ("got coordinates from [499700.0, 3999700.0] to [500300.0", SQUARES, {"crs": "EPSG:4326"}),
     ("fire.gpkg: expected perimeters, got:", [], {}),
 ]  # fmt: skip
 

@@ -13,7 +13,7 @@ use emberwatch_model::settings;
 use emberwatch_model::settings::{ANY, SettingError, Settings, Start, WorldSettings};
 use emberwatch_model::task::{Task, TaskError};
 use emberwatch_model::text::{parse_problem, read_text, shortened};
-use emberwatch_model::{Model, Ratio, Shape, TRANSITIONS_FORM};
+use emberwatch_model::{Hazards, Model, Ratio, Shape, TRANSITIONS_FORM};
 use serde_json::{Map, Value};
 use std::fmt::Display;
 use std::path::Path;
@@ -125,6 +125,23 @@ impl Checked {
         self.config.check_ranges()?;
         self.config.check_robots(self.shape)?;
         Ok(self)
+    }
+
+    /// Describes the model in a line.
+    pub fn about_model(&self) -> String {
+        let (model, file) = (&self.model, self.model.file());
+        let rule = if file.transitions.is_empty() {
+            format!("{} kernel entries", file.kernel.len())
+        } else {
+            format!("{} transitions", file.transitions.len())
+        };
+        let maps = model.hazards().and_then(Hazards::shape);
+        let maps = maps.map_or_else(String::new, |shape| format!(", maps {shape}"));
+        format!(
+            "model {:?}: {} states, {rule}{maps}",
+            shortened(model.name()),
+            model.n_states()
+        )
     }
 
     /// Describes settings that are valid, but with which robots or filters do badly.

@@ -228,7 +228,8 @@ impl Checker<'_> {
         let mut kernel = Array4::zeros((n_states, n_states, height, width));
         let mut filled = HashSet::new();
         for entry in &file.kernel {
-            let (to, from) = (self.state(file, &entry.to)?, self.state(file, &entry.from)?);
+            let state = |name: &str| self.state(file, entry.what(), name);
+            let (to, from) = (state(&entry.to)?, state(&entry.from)?);
             if !filled.insert((to, from)) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
@@ -260,7 +261,8 @@ impl Checker<'_> {
         let mut transitions = vec![Vec::new(); file.states.len()];
         let (mut size, mut used) = ([1, 1], HashSet::new());
         for entry in &file.transitions {
-            let (from, to) = (self.state(file, &entry.from)?, self.state(file, &entry.to)?);
+            let state = |name: &str| self.state(file, entry.what(), name);
+            let (from, to) = (state(&entry.from)?, state(&entry.to)?);
             if from == to {
                 return self.wrong(entry.what(), "another state", format!("{:?}", entry.to));
             }
@@ -360,8 +362,9 @@ impl Checker<'_> {
         name: &str,
         table: &[Vec<f64>],
     ) -> Result<([usize; 2], Vec<Near>), ModelError> {
-        let (state, part) = (self.state(file, name)?, format!("near.{name}"));
+        let part = format!("near.{name}");
         let what = || format!("{}: {part}", entry.what());
+        let state = self.state(file, what(), name)?;
         let size = [table.len(), table.first().map_or(0, Vec::len)];
         self.is_odd(what(), size)?;
         if let Some(got) = table.iter().map(Vec::len).find(|&length| length != size[1]) {
@@ -417,27 +420,20 @@ impl Checker<'_> {
 
     /// Returns the state of the cells outside the grid, if the file names one.
     pub fn edge(&self, file: &ModelFile) -> Result<Option<usize>, ModelError> {
-        let Some(name) = &file.edge else {
-            return Ok(None);
-        };
-        let names: Vec<&str> = file.states.iter().map(|it| it.name.as_str()).collect();
-        let state = names.iter().position(|known| known == name);
-        if state.is_none() {
-            let expected = format!(
-                "the name of a state, one of {}",
-                shortened(&format!("{names:?}"))
-            );
-            return self.wrong("edge".into(), &expected, format!("{name:?}"));
-        }
-        Ok(state)
+        let name = file.edge.as_deref();
+        name.map(|name| self.state(file, "edge".into(), name))
+            .transpose()
     }
 
-    fn state(&self, file: &ModelFile, name: &str) -> Result<usize, ModelError> {
-        let found = file.states.iter().position(|state| state.name == name);
-        found.ok_or_else(|| ModelError::UnknownState {
-            model: self.model.into(),
-            name: name.into(),
-            known: file.states.iter().map(|state| state.name.clone()).collect(),
-        })
+    /// Returns the number of a state. `what` is the entry that names it, for errors.
+    fn state(&self, file: &ModelFile, what: String, name: &str) -> Result<usize, ModelError> {
+        let names: Vec<&str> = file.states.iter().map(|it| it.name.as_str()).collect();
+        let found = names.iter().position(|&known| known == name);
+        let Some(state) = found else {
+            let known = format!("{names:?}");
+            let expected = format!("the name of a state, one of {}", shortened(&known));
+            return self.wrong(what, &expected, format!("{name:?}"));
+        };
+        Ok(state)
     }
 }

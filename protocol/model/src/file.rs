@@ -6,7 +6,7 @@ use super::maps::MapsEntry;
 use crate::text::{parse_problem, read_text, shortened};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use thiserror::Error;
 
 /// Maximum number of states, and of observations: 64.
@@ -177,25 +177,10 @@ pub enum ModelError {
     /// A file cannot be read.
     #[error("{}: {problem}", shortened(path))]
     File {
-        /// The file.
+        /// The file, after the key that names it.
         path: String,
         /// The system's error.
         problem: String,
-    },
-    /// A kernel entry or a transition names an unknown state.
-    #[error(
-        "model {:?}: an entry names state {:?}, expected one of {}",
-        shortened(model),
-        shortened(name),
-        shortened(&format!("{known:?}"))
-    )]
-    UnknownState {
-        /// The model's name.
-        model: String,
-        /// The name in the entry.
-        name: String,
-        /// The model's states.
-        known: Vec<String>,
     },
     /// An entry has a wrong value.
     #[error(
@@ -283,18 +268,19 @@ impl ModelFile {
     /// # Errors
     /// If a file cannot be read or parsed.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
-        let failed = |path: &Path, problem: String| ModelError::File {
-            path: path.display().to_string(),
+        let failed = |key: &str, path: &Path, problem: String| ModelError::File {
+            path: format!("{key}{}", path.display()),
             problem,
         };
-        let text = read_text(path).map_err(|error| failed(path, error.to_string()))?;
+        let text = read_text(path).map_err(|error| failed("", path, error.to_string()))?;
         let mut file: Self = toml::from_str(&text)?;
-        let failed = |(path, problem): (PathBuf, String)| failed(&path, problem);
         if let Some(map) = &mut file.no_fly {
-            map.read_beside(path).map_err(failed)?;
+            map.read_beside(path)
+                .map_err(|(path, problem)| failed("no_fly: ", &path, problem))?;
         }
         if let Some(maps) = &mut file.maps {
-            maps.read_beside(path).map_err(failed)?;
+            maps.read_beside(path)
+                .map_err(|(path, problem)| failed("maps: ", &path, problem))?;
         }
         Ok(file)
     }

@@ -1,7 +1,7 @@
 //! Compares the cells where robots may fly, and the cells that they see, with the results of plain loops over the grid.
 
 use super::models::{shape, unit};
-use emberwatch_model::{Airspace, Cell, CellMap, Grid, Model, Move, Parts};
+use emberwatch_model::{Airspace, Cell, CellMap, Grid, MapsEntry, Model, Move, Parts};
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -110,7 +110,13 @@ fn maps_are_read_beside_the_model() {
         let error = Model::read(&path).expect_err(words).to_string();
         assert!(error.contains(words), "{error}");
     };
-    check("no_fly.npy");
+    check(&format!("no_fly: {}: No such file", place.display()));
+    let mut other = Model::wildfire().file().clone();
+    other.maps = Some(MapsEntry::File("land.npz".into()));
+    std::fs::write(&path, toml::to_string(&other).expect("TOML")).expect("a file");
+    let land = folder.join("land.npz");
+    check(&format!("maps: {}: No such file", land.display()));
+    std::fs::write(&path, toml::to_string(&file).expect("TOML")).expect("a file");
     let map = random_map(3, (4, 5));
     ndarray_npy::write_npy(&place, &map).expect("bool");
     let model = Model::read(&path).expect("a model");

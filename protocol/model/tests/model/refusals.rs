@@ -88,7 +88,7 @@ scale = 1.0 => scale = nan => expected finite weights >= 0, got NaN
 scale = 1.0 => scale = -1.0 => expected finite weights >= 0, got -1
 scale = 1.0 => scale = 0.0 => transition weights of cell (0, 0) can sum to zero
 scale = 1.0, weights = [[1.0]] => weights = [[1e30]] => transition weights of cell (0, 0) can sum to 4.9999999999999995e-31 times the largest weight
-from = "b", to = "a" => from = "b", to = "ash" => an entry names state "ash"
+from = "b", to = "a" => from = "b", to = "ash" => kernel from "b" to "ash": expected the name of a state, one of ["a", "b"], got "ash"
 from = "b", to = "a", scale => from = "a", to = "b", scale => transition weights of cell (0, 0) can sum to zero
 [[0, 0, 1]] => [[0, 0]] => no_fly: expected a map of the 1 x 3 grid, got 1 x 2
 [[0, 0, 1]] => [[0, 0, 2]] => no_fly: expected 0 or 1 for each cell, got 2
@@ -111,9 +111,9 @@ const WRONG_HAZARDS: &str = r##"
 name = "land" => name = "land", kernel_size = [1, 1] => model file: 
 [[transitions]] => kernel_size = [1, 3]\n[[transitions]] => kernel_size: expected none, because `near` has the size, got [1, 3]
 initial = 0.75 => initial = 0.75, bias = 1.0 => state "a": bias: expected none, because transitions have `base`, got 1
-to = "b" => to = "ash" => an entry names state "ash"
+to = "b" => to = "ash" => transition from "a" to "ash": expected the name of a state, one of ["a", "b"], got "ash"
 to = "b" => to = "a" => transition from "a" to "a": expected another state, got "a"
-near.b => near.ash => an entry names state "ash"
+near.b => near.ash => transition from "a" to "b": near.ash: expected the name of a state, one of ["a", "b"], got "ash"
 base = 0.25 => base = 1.5 => transition from "a" to "b": base: expected a probability: 0, or 1e-9 to 1, got 1.5
 base = 0.25 => base = -0.1 => base: expected a probability: 0, or 1e-9 to 1, got -0.1
 base = 0.25 => base = 1e-10 => base: expected a probability: 0, or 1e-9 to 1, got 0.0000000001

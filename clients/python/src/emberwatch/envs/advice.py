@@ -32,8 +32,8 @@ def about_barren_worlds(spec: WorldSpec, answer: StepAnswer) -> str | None:
         return None
     return (
         f"no cell of world {barren[0]} is in the state that pays most (the same in "
-        f"{len(barren)} of {len(worlds)} worlds): use a longer burn_in, a larger grid, or a "
-        "model for small grids, model='wildfire-small'"
+        f"{len(barren)} of {len(worlds)} worlds): use a longer burn_in (0 for a model that dies "
+        "out), a larger grid, or a model for small grids, model='wildfire-small'"
     )
 
 

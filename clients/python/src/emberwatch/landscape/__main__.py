@@ -1,12 +1,12 @@
 """`python -m emberwatch.landscape`: converts rasters of fires to a recorded world."""
 
 import argparse
-import math
 import sys
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from emberwatch.common.output import end_with_reader
 from emberwatch.common.paths import shown, utf8
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
 from emberwatch.landscape import land
 from emberwatch.landscape.fire import BURNING, BURNT, KINDS, UNBURNT, Meaning, states, times
-from emberwatch.landscape.flags import add_common, of_flags, several, whole
+from emberwatch.landscape.flags import Parser, add_common, of_flags, several, whole
 from emberwatch.landscape.grid import Place, check_alike
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice
@@ -39,6 +39,11 @@ _ONLY_FOR: Final = {
     "missing_is_unburnt": ("mask", "burning", "states"),
 }
 
+_BEGIN: Final = several(
+    float,
+    "a number in the unit of arrival times (for dates, seconds since 1970: date -ud DATE +%s)",
+    lambda it: len(it) == 1 and np.isfinite(it).all(),
+)
 _CODES: Final = several(
     float,
     "three different numbers",
@@ -63,11 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _import(flags)
     except (EmberwatchError, OSError) as error:
-        parser.exit(2, f"{_NAME}: {error}\n")
+        parser.error(str(error))
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=_NAME,
         description="Make a recorded world for `emberwatch-server --states` from rasters, "
         "perimeters or detections of a fire. docs/landscapes.md describes formats and flags.",
@@ -79,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--kind", required=True, choices=KINDS, help="meaning of the numbers in the files")
     add("--step", required=True, metavar="TIME", help="duration of a step, such as '10 min'")
     add("--unit", choices=("ms", "s", "min", "h", "d"), help="unit of times [the file's]")
-    add("--begin", type=float, metavar="X", help="arrival time of step 0 [the earliest]")
+    add("--begin", type=_BEGIN, metavar="X", help="arrival time of step 0 [the earliest]")
     add("--year-days", type=whole, metavar="N", help="days of the year before New Year")
     add("--burning", type=whole, metavar="N", help="steps that a cell burns (arrival, mask)")
     add("--every", type=whole, metavar="N", help="make a step of every N-th layer [1]")
@@ -159,8 +164,7 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         )
     if flags.cell is not None and (flags.height, flags.width) != (None, None):
         raise InvalidArgumentError("--cell: cannot be combined with --height or --width")
-    if flags.begin is not None and not math.isfinite(flags.begin):
-        raise invalid("--begin", "a number", flags.begin)
+    flags.begin = None if flags.begin is None else flags.begin[0]
     flags.cell = None if flags.cell is None else side("--cell", flags.cell).metres
     flags.nodata = tuple(flags.nodata or ())
     flags.seconds = length(flags.step)
@@ -173,9 +177,12 @@ def _summary(sequence: NDArray[np.uint8]) -> str:
     n_steps, height, width = sequence.shape
     burning = (sequence == BURNING).sum(axis=(1, 2))
     burnt = (sequence[-1] >= BURNING).mean()
+    alight = [-1, *np.flatnonzero(burning).tolist()]
+    gaps = [f"{end + 1} to {begin - 1}" for end, begin in pairwise(alight) if begin > end + 1]
+    warning = f"\nwarning: no cell burns in steps {', '.join(gaps[:9])}" if gaps else ""
     return (
         f"{n_steps} steps of {height} x {width} cells: at most {burning.max()} burn, "
-        f"at step {burning.argmax()}; {100 * burnt:.1f} % have burnt at the end"
+        f"at step {burning.argmax()}; {100 * burnt:.1f} % have burnt at the end{warning}"
     )
 
 

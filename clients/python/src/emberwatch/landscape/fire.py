@@ -89,7 +89,9 @@ def states(fire: Times) -> NDArray[np.uint8]:
     """Computes the states of a fire in each step, shape (K, H, W)."""
     height, width = fire.place.shape
     if fire.n_steps < 2:
-        raise invalid(fire.name, "at least 2 steps", fire.n_steps)
+        got = f"{fire.n_steps}: all cells that burn begin in it"
+        remedy = "use a shorter --step, or merge the files of one fire (ogrmerge.py -single)"
+        raise invalid(fire.name, "at least 2 steps", f"{got}; {remedy}")
     if fire.n_steps * height * width > MOST_STATES:
         got = f"{fire.n_steps} steps of {height} x {width} cells"
         remedy = "use a longer --step or --every, or a smaller grid"
@@ -112,13 +114,14 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
         raise invalid(layer.name, "cells that burn", "none")
     unit = unit_of(layer.clock, meaning.unit, layer.name)
     if unit is None:
-        expected = f"s, min, h or d, as {layer.name} does not state the unit of times"
+        expected = f"ms, s, min, h or d, as {layer.name} does not state the unit of times"
         raise invalid("--unit", expected, "none")
     notes = layer.notes + _over_new_year(arrival, unit, layer.name, meaning)
     latest = np.max(arrival, where=burns, initial=-np.inf)
     begin = float(arrival.min()) if meaning.begin is None else meaning.begin
     rounding = float(np.spacing(np.array(latest, layer.stored))) if layer.stored.kind == "f" else 0
     place, first, last = _on_world(arrival, arrival, layer, meaning)
+    moments = np.unique(first[np.isfinite(first)])
     # A step shows the fire at the step's time, so a cell that begins to burn later first burns in
     # the next step.
     first, last, latest = (
@@ -131,7 +134,13 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
         for at in (first, last, latest)
     )
     date = layer.clock.date(begin * SECONDS[unit])
-    return Times(first, last + meaning.burning, int(latest) + 1, place, layer.name, date, notes)
+    since, until = (
+        layer.clock.date(at * SECONDS[unit]) or f"{at:.13g} {unit}" for at in moments[[0, -1]]
+    )
+    n_steps, n_lit = int(latest) + 1, len(np.unique(first[np.isfinite(first)]))
+    words = f"cells begin to burn at {len(moments)} times from {since} to {until}"
+    notes = (*notes, f"{words}, in {n_lit} of {n_steps} steps")
+    return Times(first, last + meaning.burning, n_steps, place, layer.name, date, notes)
 
 
 def _check_negative(layer: Layer, meaning: Meaning) -> None:

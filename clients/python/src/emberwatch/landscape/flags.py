@@ -3,7 +3,15 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
+from typing import Any, NoReturn
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exits with code 2 and the message."""
+        self.exit(2, f"{self.prog}: {message}\n")
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.compass import POINTS, bearing
 from emberwatch.landscape.elevation import slopes
-from emberwatch.landscape.flags import add_common, several
+from emberwatch.landscape.flags import Parser, add_common, several
 from emberwatch.landscape.grid import check_same
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Choice, Layer, check_full
@@ -38,11 +38,11 @@ def main(arguments: Sequence[str]) -> None:
     try:
         _make(flags)
     except (EmberwatchError, OSError) as error:
-        parser.exit(2, f"{_NAME}: {error}\n")
+        parser.error(str(error))
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=_NAME,
         description="Make a model file with maps from rasters. docs/land.md describes the flags.",
     )

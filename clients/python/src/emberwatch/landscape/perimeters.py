@@ -67,11 +67,15 @@ def on_plane(file: Path, shapes: Any) -> Any:
         return shapes
     try:
         projected = shapes.to_crs(shapes.estimate_utm_crs())
-    except RuntimeError as error:  # beyond all zones
-        raise invalid(file, "shapes in a zone of UTM", error) from None
-    if not np.isfinite(projected.total_bounds).all():
-        raise invalid(file, "shapes on the Earth", f"bounds {shapes.total_bounds.tolist()}")
-    return projected
+        if np.isfinite(projected.total_bounds).all():
+            return projected
+    except RuntimeError:  # beyond all zones
+        pass
+    got = (
+        f"coordinates from {shapes.total_bounds[:2].tolist()} to {shapes.total_bounds[2:].tolist()}"
+    )
+    remedy = "if these are not degrees, set the projection that they have (ogr2ogr -a_srs)"
+    raise invalid(file, "degrees in a zone of UTM", f"{got}; {remedy}")
 
 
 def drawn(file: Path, shapes: Any, times: Any, choice: Choice, **more: Any) -> Layer:
@@ -108,7 +112,8 @@ def _polygons(file: Path, table: Any) -> tuple[Any, list[str]]:
     for row, one in enumerate(shapes):
         kind = "none" if one is None or one.is_empty else one.geom_type
         if kind not in ("Polygon", "MultiPolygon"):
-            raise invalid(file, "a polygon in each row", f"{kind} in row {row}")
+            remedy = "; for detections, use the CSV file of FIRMS" if kind == "Point" else ""
+            raise invalid(file, "a polygon in each row", f"{kind} in row {row}{remedy}")
     if shapes.crs is None:
         remedy = "set it (ogr2ogr -a_srs)"
         raise invalid(file, "a coordinate reference system", f"none; {remedy}")
@@ -125,12 +130,14 @@ def _times(file: Path, columns: Any, wanted: str | None) -> tuple[Any, Clock, li
     words = {name: columns[name].astype(object).fillna("").astype(str) for name in columns}
     dated = [name for name, column in words.items() if column.str.match(_DATE).any()]
     if wanted is None and len(dated) != 1:
-        got = f"{len(dated)} ({', '.join(map(str, dated)) or known}); choose with --time-column"
+        has_choice = dated or any(columns[name].dtype.kind in "if" for name in columns)
+        remedy = "choose with --time-column" if has_choice else "add one"
+        got = f"{len(dated)} ({', '.join(map(str, dated)) or known}); {remedy}"
         raise invalid(file, "one column of times such as 2020-08-31T12:00:00Z", got)
     name = dated[0] if wanted is None else wanted
     if name not in dated and columns[name].dtype.kind in "if":
         return columns[name].to_numpy(np.float64), Clock(), []
-    seconds = seconds_of(f"{file}, {name}", words[name].str.replace("/", "-"))
+    seconds = seconds_of(f"{file}, {name}", words[name])
     zoned = words[name].str.contains(_ZONE)
     if zoned.any() and not zoned.all():
         got = f"'{words[name][zoned].iloc[0]}' and '{words[name][~zoned].iloc[0]}'"

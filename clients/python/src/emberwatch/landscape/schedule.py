@@ -1,6 +1,7 @@
 """Times in files, such as `hours since 2020-08-01`, and the step that first shows each layer."""
 
 import math
+import string
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -47,11 +48,14 @@ class Clock(NamedTuple):
             return None
 
     def date(self, seconds: float) -> str | None:
-        """Returns the date `seconds` after time 0; None if the date of time 0 is unknown."""
+        """Returns the date `seconds` after time 0; None if it is unknown, or beyond all dates."""
         epoch = self.epoch()
         if epoch is None:
             return None
-        date = library("cftime", "times").num2date(epoch + seconds, SINCE_1970, self.calendar)
+        try:
+            date = library("cftime", "times").num2date(epoch + seconds, SINCE_1970, self.calendar)
+        except OverflowError:
+            return None
         words = "" if self.calendar == "standard" else f" ({self.calendar} calendar)"
         return f"{date:%Y-%m-%d %H:%M:%S} UTC{words}"
 
@@ -120,9 +124,9 @@ def schedule(
 
 def length(text: str) -> float:
     """Parses a length of time such as `10 min` to seconds."""
-    number, _, unit = text.strip().partition(" ")
+    number = text.rstrip(string.ascii_letters + " ")
     try:
-        seconds = float(number) * SECONDS[_unit(unit)]
+        seconds = float(number) * SECONDS[_unit(text[len(number) :])]
     except (KeyError, ValueError):
         seconds = 0.0
     if not 0.0 < seconds < math.inf:
