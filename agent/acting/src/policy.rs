@@ -10,6 +10,6 @@ mod planners;
 pub use self::decisions::LearnedDecisions;
 pub use self::help::help;
 pub use self::ladder::{ladder, options_table};
-pub use self::names::{check_name, planner_of};
+pub use self::names::{GOALS, GoalEntry, check_name, planner_of};
 pub use self::parts::{Goal, Policy, network_choices};
 pub use self::planners::{AHEAD, BEAM, BY_OPTIONS, PLANNERS, PlannerKind, RANDOM, SHOOTING};

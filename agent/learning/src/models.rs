@@ -1,6 +1,7 @@
 //! Learned models in checkpoints: the filter, and the neural belief with the filter that it may correct.
 
 use crate::checkpoint::{Part, check, wrong};
+use crate::reward::RewardEstimate;
 use anyhow::Result;
 use emberwatch_acting::beliefs::learned::LearnedModel;
 use emberwatch_acting::beliefs::neural::NeuralModel;
@@ -96,6 +97,20 @@ impl SavedNeuralModel {
         Ok(Some(Box::new(filter.read(&part.part(FILTER))?)))
     }
 }
+
+/// What a checkpoint of a learned belief stores besides its tensors. `M` is its model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SavedBeliefLearner<M> {
+    pub model: M,
+    pub reward: RewardEstimate,
+    pub n_updates: u64,
+    /// Number of world steps, for all worlds together.
+    pub world_steps: u64,
+}
+
+pub type SavedFilter = SavedBeliefLearner<SavedModel>;
+
+pub type SavedNeural = SavedBeliefLearner<SavedNeuralModel>;
 
 /// Returns the parameters of a filter as named tensors.
 pub fn filter_tensors(model: &LearnedModel) -> [NamedTensor; 3] {

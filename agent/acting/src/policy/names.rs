@@ -24,8 +24,11 @@ pub(super) const NAMED: &[(&str, &str)] = &[
     ("oracle_policy", "truth/options/rule"),
 ];
 
+/// A goal with its name and a short description.
+pub type GoalEntry = (Goal, &'static str, &'static str);
+
 /// Goals of all planners except `options`. The states of the model are goals as well.
-pub(super) const GOALS: &[(Goal, &str, &str)] = &[
+pub const GOALS: &[GoalEntry] = &[
     (Goal::Coverage, "coverage", "new cells only"),
     (Goal::Explore, "explore", "the belief's entropy"),
     (
@@ -46,7 +49,7 @@ pub(super) const GOALS: &[(Goal, &str, &str)] = &[
 ];
 
 /// Goals of the planner `options`. Each option is a goal as well.
-pub(super) const OPTION_GOALS: &[(Goal, &str, &str)] = &[
+pub(super) const OPTION_GOALS: &[GoalEntry] = &[
     (
         Goal::Rule,
         "rule",
@@ -62,19 +65,14 @@ pub(super) const OPTION_GOALS: &[(Goal, &str, &str)] = &[
 /// Returns the name of the policy with the given parts.
 fn name(belief: &BeliefKind, planner: &'static PlannerKind, goal: Goal, model: &Model) -> String {
     let mut parts = format!("{}/{}", belief.name, planner.name);
-    if planner.has_goal {
+    if !planner.goals.is_empty() {
         parts = format!("{parts}/{}", goal_name(planner, goal, model));
     }
     let short = NAMED.iter().find(|(_, named)| *named == parts);
     short.map_or(parts, |(name, _)| (*name).into())
 }
 
-fn goal_name(planner: &'static PlannerKind, goal: Goal, model: &Model) -> String {
-    let goals = if *planner == BY_OPTIONS {
-        OPTION_GOALS
-    } else {
-        GOALS
-    };
+fn goal_name(planner: &PlannerKind, goal: Goal, model: &Model) -> String {
     match goal {
         Goal::Option(option) => option.name.into(),
         Goal::State(state) => {
@@ -89,7 +87,7 @@ fn goal_name(planner: &'static PlannerKind, goal: Goal, model: &Model) -> String
                 .expect("invariant: numbered names follow the names of the model's states")
         }
         _ => {
-            let found = goals.iter().find(|(other, ..)| *other == goal);
+            let found = planner.goals.iter().find(|(other, ..)| *other == goal);
             let (_, name, _) = found.expect("invariant: each goal has a name");
             (*name).into()
         }
@@ -166,7 +164,7 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
     let planner = found.ok_or_else(|| wrong("planner", &names, planner))?;
     let found = goal_of(belief, planner, goal, state);
     let mut goals = goals_of(belief, planner, states);
-    if planner.has_goal {
+    if !planner.goals.is_empty() {
         goals = one_of(&goals);
     }
     let goal = found.ok_or_else(|| wrong("goal", &goals, goal.unwrap_or_default()))?;
@@ -189,29 +187,27 @@ fn unknown(name: &str) -> String {
     )
 }
 
-/// Returns the goals that planners other than `options` accept, without the states of the model.
-fn goals(belief: &BeliefKind) -> impl Iterator<Item = &'static (Goal, &'static str, &'static str)> {
-    let decides = belief.decides();
-    let goals = GOALS.iter();
-    goals.filter(move |(goal, ..)| *goal != Goal::Learned || decides)
+/// Returns the goals that a planner accepts on a belief, besides options or the states of the model.
+fn goals(
+    belief: &BeliefKind,
+    planner: &PlannerKind,
+) -> impl Iterator<Item = &'static GoalEntry> + use<> {
+    let is_learned = belief.decides() || *planner == BY_OPTIONS;
+    let goals = planner.goals.iter();
+    goals.filter(move |(goal, ..)| *goal != Goal::Learned || is_learned)
 }
 
 fn goal_of(
     belief: &BeliefKind,
-    planner: &'static PlannerKind,
+    planner: &PlannerKind,
     name: Option<&str>,
     state: &dyn Fn(&str) -> Option<usize>,
 ) -> Option<Goal> {
-    let is_named = |(_, known, _): &&(Goal, &str, &str)| Some(*known) == name;
-    if !planner.has_goal {
+    if planner.goals.is_empty() {
         return name.is_none().then_some(Goal::Coverage);
     }
-    let found = if *planner == BY_OPTIONS {
-        OPTION_GOALS.iter().find(is_named)
-    } else {
-        goals(belief).find(is_named)
-    };
-    if let Some((goal, ..)) = found {
+    let mut own = goals(belief, planner);
+    if let Some((goal, ..)) = own.find(|(_, known, _)| Some(*known) == name) {
         return Some(*goal);
     }
     if *planner == BY_OPTIONS {
@@ -225,16 +221,14 @@ fn goal_of(
 }
 
 /// Lists the names that [`goal_of`] accepts.
-fn goals_of(belief: &BeliefKind, planner: &'static PlannerKind, states: &str) -> String {
-    if !planner.has_goal {
+fn goals_of(belief: &BeliefKind, planner: &PlannerKind, states: &str) -> String {
+    if planner.goals.is_empty() {
         return "no goal".into();
     }
-    let mut names: Vec<&str> = Vec::new();
+    let mut names: Vec<&str> = goals(belief, planner).map(|(_, name, _)| *name).collect();
     if *planner == BY_OPTIONS {
-        names.extend(OPTION_GOALS.iter().map(|(_, name, _)| name));
         names.extend(options::OPTIONS.map(|option| option.name));
     } else {
-        names.extend(goals(belief).map(|(_, name, _)| *name));
         names.extend(belief.learned_by.is_none().then_some(states));
     }
     names.join(", ")
@@ -262,11 +256,10 @@ mod tests {
             for &planner in PLANNERS {
                 let goals = goals_of(belief, planner, &model.state_names().join(", "));
                 for goal in goals.split(", ") {
-                    let parts = if !planner.has_goal {
-                        format!("{}/random", belief.name)
-                    } else {
-                        format!("{}/{}/{goal}", belief.name, planner.name)
-                    };
+                    let mut parts = format!("{}/{}", belief.name, planner.name);
+                    if !planner.goals.is_empty() {
+                        parts = format!("{parts}/{goal}");
+                    }
                     let policy = Policy::named(&parts, &model).expect("a policy");
                     assert_eq!(Policy::named(&policy.name, &model).expect(&parts), policy);
                     check_name(&policy.name).expect("known before its model");

@@ -1,5 +1,6 @@
 //! Kinds of planner, which find a policy's paths. Each kind is a constant in this file, with an entry in [`PLANNERS`].
 
+use super::names::{GOALS, GoalEntry, OPTION_GOALS};
 use crate::config::{AgentConfig, ObjectiveConfig};
 use emberwatch_belief::planning::{Ahead, BeamSearch, Planner, RandomWalk, Shooting};
 use std::fmt;
@@ -15,8 +16,8 @@ pub struct PlannerKind {
     pub about: &'static str,
     /// Returns the bonus for a new cell, in addition to the goal's value.
     pub bonus: fn(&ObjectiveConfig) -> f32,
-    /// Whether the planner needs a goal.
-    pub has_goal: bool,
+    /// The goals that it accepts, besides options or the states of the model. Empty if it ignores the values of cells.
+    pub goals: &'static [GoalEntry],
     pub build: fn(&AgentConfig) -> Box<dyn Planner + Send>,
 }
 
@@ -25,7 +26,7 @@ pub const RANDOM: PlannerKind = PlannerKind {
     name: "random",
     about: "random moves, the paper's baseline; without a goal",
     bonus: |objective| objective.shooting_bonus,
-    has_goal: false,
+    goals: &[],
     build: |_| Box::new(RandomWalk),
 };
 
@@ -34,7 +35,7 @@ pub const SHOOTING: PlannerKind = PlannerKind {
     name: "shooting",
     about: "the best of random paths, as in the paper",
     bonus: |objective| objective.shooting_bonus,
-    has_goal: true,
+    goals: GOALS,
     build: |config| {
         let (n_samples, integration) = (config.shooting_samples, config.shooting_integration);
         Box::new(Shooting::new(n_samples, integration))
@@ -45,7 +46,7 @@ pub const BEAM: PlannerKind = PlannerKind {
     name: "beam",
     about: "beam search",
     bonus: |objective| objective.beam_bonus,
-    has_goal: true,
+    goals: GOALS,
     build: |config| Box::new(BeamSearch::new(config.beam_width)),
 };
 
@@ -60,6 +61,7 @@ pub const AHEAD: PlannerKind = PlannerKind {
 pub const BY_OPTIONS: PlannerKind = PlannerKind {
     name: "options",
     about: "a choice among options, each planned by beam search",
+    goals: OPTION_GOALS,
     ..BEAM
 };
 

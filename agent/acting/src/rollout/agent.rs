@@ -3,7 +3,7 @@
 use crate::beliefs::Traits;
 use crate::config::AgentConfig;
 use crate::parallel::in_parallel;
-use crate::policy::Policy;
+use crate::policy::{Policy, RANDOM};
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
@@ -90,7 +90,7 @@ impl Agent {
         config: &AgentConfig,
         setup: Setup,
     ) -> Self {
-        let is_random = !policy.planner.has_goal;
+        let is_random = *policy.planner == RANDOM;
         let aim = if is_random {
             RANDOM_MOVES
         } else {
@@ -136,7 +136,7 @@ impl Agent {
 
     /// Plans paths as [`Self::plan`] does, but for the given objective instead of the policy's objective.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
-        let aim = if !self.policy.planner.has_goal {
+        let aim = if *self.policy.planner == RANDOM {
             RANDOM_MOVES.into()
         } else {
             objective.target.label(&self.state_names)

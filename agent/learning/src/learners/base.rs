@@ -142,9 +142,6 @@ pub trait Learner: Actor {
     /// Returns the agent of a robot, by index.
     fn agent(&self, index: usize) -> &ActingAgent;
 
-    /// Returns the state with the highest estimated reward.
-    fn target(&self) -> usize;
-
     /// Returns the number of world steps learned from, for all robots together.
     fn world_steps(&self) -> u64;
 

@@ -223,10 +223,6 @@ impl Learner for DecisionsLearner {
         &self.runs[index].acting
     }
 
-    fn target(&self) -> usize {
-        self.base.target
-    }
-
     fn world_steps(&self) -> u64 {
         self.world_steps
     }

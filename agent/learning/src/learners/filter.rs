@@ -2,9 +2,8 @@
 //! belief of the current filter.
 
 pub mod fit;
-mod saved;
 
-pub use self::saved::SavedFilter;
+pub use crate::models::SavedFilter;
 
 use crate::checkpoint::Contents;
 use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
@@ -200,10 +199,6 @@ impl Learner for FilterLearner {
 
     fn agent(&self, index: usize) -> &ActingAgent {
         &self.agents[index]
-    }
-
-    fn target(&self) -> usize {
-        self.learned.target
     }
 
     fn world_steps(&self) -> u64 {

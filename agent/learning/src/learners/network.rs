@@ -285,10 +285,6 @@ impl Learner for NetworkLearner {
         self.at_world()
     }
 
-    fn target(&self) -> usize {
-        self.progress.target()
-    }
-
     fn world_steps(&self) -> u64 {
         self.progress.iterations
     }

@@ -5,16 +5,13 @@
 
 mod behaviour;
 mod replay;
-mod saved;
-
-pub use self::saved::SavedNeural;
 
 use self::behaviour::Behaviour;
 use self::replay::LessonReplay;
 use crate::checkpoint::{Contents, check, check_counts};
 use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, lacks_steps, replace};
 use crate::learners::update::ModelUpdate;
-use crate::models::{SavedNeuralModel, corrected_tensors};
+use crate::models::{SavedNeural, SavedNeuralModel, corrected_tensors};
 use crate::reward::{RewardEstimate, met};
 use anyhow::Result;
 use emberwatch_acting::beliefs::learned::LearnedModel;
@@ -253,10 +250,6 @@ impl Learner for NeuralLearner {
 
     fn agent(&self, index: usize) -> &ActingAgent {
         &self.runs[index].acting
-    }
-
-    fn target(&self) -> usize {
-        self.paying()
     }
 
     fn world_steps(&self) -> u64 {

@@ -4,12 +4,11 @@ mod neighbours;
 
 pub use self::neighbours::Neighbours;
 
-use super::saved::SavedFilter;
 use crate::checkpoint::{Contents, check_counts};
 use crate::gradient::Adam;
 use crate::gradient::{Optimiser, Update};
 use crate::learners::base::lacks_steps;
-use crate::models::{SavedModel, named_tensors, read_parameters};
+use crate::models::{SavedFilter, SavedModel, named_tensors, read_parameters};
 use crate::replay::BlockReplay;
 use crate::reward::{RewardEstimate, met};
 use anyhow::Result;
