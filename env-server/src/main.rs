@@ -74,6 +74,9 @@ fn run(cli: &Cli) -> Result<()> {
             let config = config.transpose()?.unwrap_or_default();
             let checked = config.with(cli.settings.given())?.check()?;
             if cli.check {
+                if checked.recorded.is_none() {
+                    tracing::info!("{}", checked.about_model());
+                }
                 announce_settings(&checked);
                 return Ok(print(&toml::to_string(&checked.config)?)?);
             }

@@ -168,9 +168,6 @@ fn announce(checked: &Checked) {
 
 /// Logs how many free cells cannot be reached from random starts, and warns of settings that do badly.
 pub fn announce_settings(checked: &Checked) {
-    if checked.recorded.is_none() {
-        tracing::info!("{}", checked.about_model());
-    }
     if let Some(words) = checked.reach.cut_off() {
         tracing::info!("{words}");
     }
