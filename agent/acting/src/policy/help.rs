@@ -1,14 +1,14 @@
 //! The list of all parts of policies, for `--help` and `--policies help`.
 
-use super::names::{GOALS, NAMED, OPTION_GOALS};
-use super::parts::Goal;
+use super::goals::{GOALS, GoalEntry, OPTION_GOALS};
+use super::names::NAMED;
 use super::planners::PLANNERS;
 use crate::beliefs::BELIEFS;
 use emberwatch_belief::planning::options::OPTIONS;
 
 /// Returns a description of each part of a policy, followed by the policies that have a short name.
 pub fn help() -> String {
-    let goals = |goals: &'static [(Goal, &str, &str)]| {
+    let goals = |goals: &'static [GoalEntry]| {
         let goals = goals.iter();
         goals.map(|(_, name, about)| (*name, *about))
     };

@@ -1,6 +1,7 @@
 //! Names of policies: the names of their parts, `BELIEF/PLANNER/GOAL`, and short names for some policies.
 
-use super::parts::{Goal, Policy};
+use super::goals::{Goal, GoalEntry};
+use super::parts::Policy;
 use super::planners::{BY_OPTIONS, PLANNERS, PlannerKind};
 use crate::beliefs::{BELIEFS, BeliefKind, numbered_states};
 use anyhow::{Result, bail};
@@ -22,44 +23,6 @@ pub(super) const NAMED: &[(&str, &str)] = &[
     ("oracle_beam", "truth/beam/exploit"),
     ("oracle_ahead", "truth/ahead/exploit"),
     ("oracle_policy", "truth/options/rule"),
-];
-
-/// A goal with its name and a short description.
-pub type GoalEntry = (Goal, &'static str, &'static str);
-
-/// Goals of all planners except `options`. The states of the model are goals as well.
-pub const GOALS: &[GoalEntry] = &[
-    (Goal::Coverage, "coverage", "new cells only"),
-    (Goal::Explore, "explore", "the belief's entropy"),
-    (
-        Goal::Exploit,
-        "exploit",
-        "the state with the highest reward, with a small bonus for each new cell",
-    ),
-    (
-        Goal::ExploitOnly,
-        "exploit_only",
-        "the state with the highest reward, without a bonus",
-    ),
-    (
-        Goal::Learned,
-        "learned",
-        "the goal that a DQN chooses; only with the autoencoder",
-    ),
-];
-
-/// Goals of the planner `options`. Each option is a goal as well.
-pub(super) const OPTION_GOALS: &[GoalEntry] = &[
-    (
-        Goal::Rule,
-        "rule",
-        "best_region if that region promises more than the surroundings, otherwise exploit",
-    ),
-    (
-        Goal::Learned,
-        "learned",
-        "the option with the highest value under a DQN; needs --checkpoint",
-    ),
 ];
 
 /// Returns the name of the policy with the given parts.

@@ -1,12 +1,12 @@
 //! The parts of a policy, and the objective and checkpoints that they imply.
 
 use super::decisions::LearnedDecisions;
+use super::goals::Goal;
 use super::planners::{BEAM, BY_OPTIONS, PlannerKind, SHOOTING};
 use crate::beliefs::{AUTOENCODER, BeliefKind};
 use crate::config::AgentConfig;
 use crate::learned::Learned;
 use anyhow::{Context, Result, ensure};
-use emberwatch_belief::planning::options::PathOption;
 use emberwatch_belief::planning::{Objective, Target};
 
 /// A belief to plan on, a planner, and a goal.
@@ -17,27 +17,6 @@ pub struct Policy {
     pub belief: &'static BeliefKind,
     pub planner: &'static PlannerKind,
     pub goal: Goal,
-}
-
-/// The goal of a policy's paths.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Goal {
-    /// New cells only.
-    Coverage,
-    /// The belief's entropy.
-    Explore,
-    /// The state with the highest reward, with a small bonus for each new cell.
-    Exploit,
-    /// The state with the highest reward, without a bonus.
-    ExploitOnly,
-    /// The probability of a state of the model.
-    State(usize),
-    /// The choice of a DQN: an option, or an objective if the DQN reads an autoencoder's hidden vector.
-    Learned,
-    /// The option that a hand-written rule chooses.
-    Rule,
-    /// Always the same option.
-    Option(&'static PathOption),
 }
 
 impl Policy {

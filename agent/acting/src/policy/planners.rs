@@ -1,6 +1,6 @@
 //! Kinds of planner, which find a policy's paths. Each kind is a constant in this file, with an entry in [`PLANNERS`].
 
-use super::names::{GOALS, GoalEntry, OPTION_GOALS};
+use super::goals::{GOALS, GoalEntry, OPTION_GOALS};
 use crate::config::{AgentConfig, ObjectiveConfig};
 use emberwatch_belief::planning::{Ahead, BeamSearch, Planner, RandomWalk, Shooting};
 use std::fmt;
