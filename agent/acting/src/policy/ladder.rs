@@ -1,7 +1,8 @@
 //! The policies that are compared by default.
 
 use super::decisions::LearnedDecisions;
-use super::parts::{Goal, Policy};
+use super::goals::Goal;
+use super::parts::Policy;
 use super::planners::{AHEAD, BEAM, BY_OPTIONS, RANDOM, SHOOTING};
 use crate::beliefs::{
     AUTOENCODER, BeliefKind, Input, KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL, NONE, RECOMMENDED,
