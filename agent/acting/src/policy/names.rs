@@ -199,6 +199,7 @@ fn goals_of(belief: &BeliefKind, planner: &PlannerKind, states: &str) -> String 
 
 #[cfg(test)]
 mod tests {
+    use super::super::goals::GOALS;
     use super::*;
 
     #[test]
