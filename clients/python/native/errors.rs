@@ -35,6 +35,13 @@ pub fn interrupted() -> bool {
         })
 }
 
+/// Returns the exception of the last call of [`interrupted`] that returned true.
+pub fn raised() -> PyErr {
+    RAISED
+        .take()
+        .unwrap_or_else(|| PyKeyboardInterrupt::new_err(()))
+}
+
 /// Stores an exception, and returns the error of an interrupted wait. [`raise`] turns this error back into the
 /// exception.
 pub fn interruption(raised: PyErr) -> ConnectionError {
@@ -109,9 +116,7 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
 pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
     let text = problem.to_string();
     match problem {
-        ChannelError::Interrupted => RAISED
-            .take()
-            .unwrap_or_else(|| PyKeyboardInterrupt::new_err(())),
+        ChannelError::Interrupted => raised(),
         ChannelError::InstanceName(name) => {
             let expected = "1 to 64 characters from A-Z a-z 0-9 - _";
             error(

@@ -1,28 +1,28 @@
 //! The agent's estimators for Python: beliefs of one kind about `n` worlds, which are corrected with frames.
 
 use crate::detached::detached;
-use crate::errors::warn;
-use crate::model::{model_of, shape_of};
-use crate::origin::{Origin, checkpoint_bytes, decoded, kind_of, no_prior, unfit};
+use crate::errors::{check_memory, raised};
+use crate::model::shape_of;
+use crate::origin::{Origin, checkpoint_bytes, kind_of, no_prior, unfit};
 use crate::refusal::{failed, invalid, refused};
-use crate::threads::{Pool, Threads};
-use emberwatch_acting::beliefs::WorldForm;
-use emberwatch_acting::learned::{Learned, WorldNames};
-use emberwatch_acting::options::usual;
+use crate::saved::{Header, Saved, is_saved};
+use crate::threads::Pool;
 use emberwatch_belief::brier::{accuracy, brier_score, log_loss};
 use emberwatch_belief::estimation::SpatialFilter;
 use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
 use emberwatch_belief::estimation::scoring::score;
+use emberwatch_learning::file::replace_file;
 use emberwatch_model::frame::FrameError;
+use emberwatch_model::randomness::{Purpose, stream};
 use emberwatch_model::{Frame, Grid, Model, Shape};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
-use pyo3::types::PyTuple;
+use pyo3::types::{PyBytes, PyTuple};
 use std::any::Any;
 use std::path::PathBuf;
-use std::sync::{Mutex, MutexGuard, TryLockError};
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 
 /// An array with one number per world.
 type Numbers<'py> = Bound<'py, PyArray1<f64>>;
@@ -41,14 +41,21 @@ pub struct Estimators {
     #[pyo3(get)]
     n_observations: usize,
     n_worlds: usize,
+    /// Whether Python's arrays have no axis for worlds.
+    #[pyo3(get)]
+    is_single: bool,
     shape: Shape,
-    origin: Origin,
+    /// Copies share it.
+    origin: Arc<Origin>,
     state: Mutex<State>,
 }
 
 /// The estimators and their threads, which only one call at a time may use.
 struct State {
     worlds: Vec<Box<dyn Estimator>>,
+    /// Number of predictions of each world since the first belief. `None` if a signal interrupted a call, so that it is
+    /// unknown whether the call changed the world's belief.
+    steps: Vec<Option<u64>>,
     threads: Pool,
 }
 
@@ -70,64 +77,102 @@ impl Estimators {
         model: &str,
         prior: PyReadonlyArray3<'_, f32>,
         kind: &Bound<'_, PyAny>,
-        n_worlds: usize,
+        n_worlds: Option<usize>,
     ) -> PyResult<Self> {
         let kind = kind_of(kind, false)?;
-        let (model, prior) = (model_of(model)?, prior.as_array());
-        let (n_states, height, width) = prior.dim();
-        if n_states != model.n_states() {
-            let expected = format!("shape ({}, H, W)", model.n_states());
-            return Err(invalid(py, "prior", expected, format!("{:?}", prior.dim())));
-        }
-        let shape = shape_of(py, height, width)?;
-        let prior = Belief::from_probabilities(prior.to_owned());
+        let (_, height, width) = prior.as_array().dim();
+        shape_of(py, height, width)?;
+        let prior = Belief::from_probabilities(prior.as_array().to_owned());
         let prior = prior.map_err(|error| no_prior(py, error))?;
-        let origin = Origin {
-            kind,
-            model: Some(model),
-            prior: Some(prior),
-            learned: Learned::default(),
-            shape,
-        };
-        Self::new(py, origin, n_worlds)
+        Self::new(py, Origin::known(py, model, prior, kind)?, n_worlds)
     }
 
-    /// Loads beliefs from a checkpoint. `kind` defaults to the kind that the checkpoint was trained for. If a model is
-    /// given, checks that the checkpoint fits it.
+    /// Loads beliefs from a checkpoint, or from a file of `save`. `kind` defaults to the kind that the checkpoint was
+    /// trained for. If a model is given, checks that the checkpoint fits it. A saved belief takes no other arguments.
     #[staticmethod]
     fn load(
         py: Python<'_>,
-        checkpoint: PathBuf,
-        grid: (usize, usize),
+        file: PathBuf,
+        grid: Option<(usize, usize)>,
         kind: Option<&Bound<'_, PyAny>>,
         model: Option<&str>,
-        n_worlds: usize,
+        n_worlds: Option<usize>,
     ) -> PyResult<Self> {
-        let shape = shape_of(py, grid.0, grid.1)?;
-        let kind = kind.map(|name| kind_of(name, true)).transpose()?;
-        let model = model.map(model_of).transpose()?;
-        let path = checkpoint.display().to_string();
-        let learned = decoded(py, &path, &checkpoint_bytes(py, checkpoint)?)?;
-        let kind = kind.unwrap_or_else(|| usual(&learned));
-        if kind.learned_by.is_none() {
-            let got = format!("decisions on the belief '{}': use known(model)", kind.name);
-            return Err(invalid(py, "checkpoint", "a learned belief", got));
+        let name = file.display().to_string();
+        let bytes = checkpoint_bytes(py, file)?;
+        if is_saved(&bytes) {
+            let is_bare = grid.is_none() && kind.is_none() && model.is_none() && n_worlds.is_none();
+            if !is_bare {
+                let expected = "no other arguments, as a saved belief has its own";
+                return Err(invalid(py, format!("belief {name}"), expected, "some"));
+            }
+            return Self::from_bytes(py, &bytes);
         }
-        let names = model.as_ref().map(WorldNames::of);
-        if let Some(warning) = names.and_then(|names| learned.warning_in(&names)) {
-            warn(py, warning)?;
-        }
-        let form = model.as_ref().map(|model| WorldForm::of(model, shape));
-        let fits = form.map_or(Ok(()), |form| kind.check(&learned, &form));
-        fits.map_err(|error| refused(py, format!("{error:#}")))?;
-        let origin = Origin {
-            kind,
-            model,
-            prior: None,
-            learned,
-            shape,
+        let Some((height, width)) = grid else {
+            let expected = "those of the grid, as the file is a checkpoint";
+            return Err(invalid(py, "height and width", expected, "None"));
         };
+        let shape = shape_of(py, height, width)?;
+        let kind = kind.map(|name| kind_of(name, true)).transpose()?;
+        let origin = Origin::learned(py, &name, bytes.into_owned(), shape, kind, model)?;
+        origin.warn_of_other_worlds(py)?;
         Self::new(py, origin, n_worlds)
+    }
+
+    /// Returns an independent copy.
+    fn copy(&self, py: Python<'_>) -> PyResult<Self> {
+        let (steps, worlds, _) = self.saved(py)?;
+        let copy = Self::of(py, Arc::clone(&self.origin), self.n_worlds, self.is_single)?;
+        copy.restore(py, &steps, &worlds)?;
+        Ok(copy)
+    }
+
+    /// Returns the beliefs and everything that they are built from, for [`Self::from_bytes`].
+    fn to_bytes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
+        Ok(PyBytes::new(py, &self.encoded(py)?))
+    }
+
+    #[staticmethod]
+    fn from_bytes(py: Python<'_>, bytes: &[u8]) -> PyResult<Self> {
+        let saved = Saved::from_bytes(bytes)
+            .ok_or_else(|| invalid(py, "belief", "bytes of a saved belief", "damaged ones"))?;
+        let (origin, header) = (Origin::saved(py, &saved)?, &saved.header);
+        let it = Self::of(py, Arc::new(origin), saved.worlds.len(), header.is_single)?;
+        it.restore(py, &header.steps, &saved.worlds)?;
+        Ok(it)
+    }
+
+    /// Writes the bytes of [`Self::to_bytes`] to a file, completely or not at all.
+    fn save(&self, py: Python<'_>, file: PathBuf) -> PyResult<()> {
+        let bytes = self.encoded(py)?;
+        let written = py.detach(|| replace_file(&file, &bytes));
+        written.map_err(|error| refused(py, format!("belief: {error:#}")))
+    }
+
+    /// Returns the number of predictions of each world since the first belief. `None` after an interrupted call.
+    fn steps(&self, py: Python<'_>) -> PyResult<Vec<Option<u64>>> {
+        Ok(self.locked(py)?.steps.clone())
+    }
+
+    /// Draws each cell's state from its own distribution, `[n, H, W]`.
+    fn sample<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<Bound<'py, PyArray3<u8>>> {
+        if self.origin.kind.of_observations {
+            let got = format!("'{}', which predicts observations", self.kind);
+            return Err(invalid(py, "sample", "a belief about states", got));
+        }
+        let mut state = self.state(py)?;
+        let State {
+            worlds, threads, ..
+        } = &mut *state;
+        let (height, width) = self.shape.dim();
+        let mut out = Array3::zeros((worlds.len(), height, width));
+        let tasks = worlds.iter_mut().zip(out.outer_iter_mut()).enumerate();
+        let is_short = self.origin.is_short(self.n_worlds);
+        self.each(py, threads, is_short, tasks, |(index, (world, mut out))| {
+            let mut rng = stream(seed, Purpose::Sample, index as u64);
+            out.assign(&world.belief().sample(&mut rng));
+        })?;
+        Ok(out.into_pyarray(py))
     }
 
     /// Returns the number of worlds, the height and the width.
@@ -138,24 +183,31 @@ impl Estimators {
 
     /// Returns the beliefs, `[S, n, H, W]`: about X_k after `correct`, about X_{k+1} after `predict`.
     fn belief<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray4<f32>>> {
-        let state = self.state(py)?;
+        let mut state = self.state(py)?;
+        let State {
+            worlds, threads, ..
+        } = &mut *state;
         let (height, width) = self.shape.dim();
-        let dim = (self.state_names.len(), state.worlds.len(), height, width);
-        let mut out = Array4::zeros(dim);
-        for (world, mut out) in state.worlds.iter().zip(out.axis_iter_mut(Axis(1))) {
+        let mut out = Array4::zeros((self.state_names.len(), worlds.len(), height, width));
+        let tasks = worlds.iter_mut().zip(out.axis_iter_mut(Axis(1)));
+        self.each(py, threads, true, tasks, |(world, mut out)| {
             out.assign(&world.belief().view());
-        }
+        })?;
         Ok(out.into_pyarray(py))
     }
 
     /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
-        let state = self.state(py)?;
+        let mut state = self.state(py)?;
+        let State {
+            worlds, threads, ..
+        } = &mut *state;
         let (height, width) = self.shape.dim();
-        let mut out = Array3::zeros((state.worlds.len(), height, width));
-        for (world, mut out) in state.worlds.iter().zip(out.outer_iter_mut()) {
+        let mut out = Array3::zeros((worlds.len(), height, width));
+        let tasks = worlds.iter_mut().zip(out.outer_iter_mut());
+        self.each(py, threads, true, tasks, |(world, mut out)| {
             out.assign(&world.belief().entropy(EntropyKind::Sum));
-        }
+        })?;
         Ok(out.into_pyarray(py))
     }
 
@@ -167,27 +219,28 @@ impl Estimators {
         chosen: PyReadonlyArray1<'_, bool>,
         keeps_correlations: bool,
     ) -> PyResult<()> {
-        let mut state = self.state(py)?;
+        let mut state = self.locked(py)?;
         let chosen = chosen.as_slice()?;
         let n_chosen = chosen.iter().filter(|chosen| **chosen).count();
-        let State { worlds, threads } = &mut *state;
-        let chosen = worlds.iter_mut().zip(chosen);
-        let chosen = chosen.filter_map(|(world, &chosen)| chosen.then_some(world));
-        let reset = detached(py, n_chosen * self.n_numbers(), || {
-            threads.work(self.origin.is_short(n_chosen), |threads| {
-                threads.each(chosen, |world| {
-                    let mut new = self.origin.estimator()?;
-                    if keeps_correlations {
-                        keep_correlations(&**world, &mut *new);
-                    }
-                    Ok((world, new))
-                })
-            })
+        let State {
+            worlds,
+            steps,
+            threads,
+        } = &mut *state;
+        let tasks = worlds.iter_mut().zip(steps).zip(chosen);
+        let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
+        let is_short = self.origin.is_short(n_chosen);
+        let reset = self.each(py, threads, is_short, tasks, |(world, step)| {
+            let mut new = self.origin.estimator()?;
+            if keeps_correlations {
+                keep_correlations(&**world, &mut *new);
+            }
+            Ok((world, step, new))
         });
         // Either all worlds are reset, or none.
-        let reset: anyhow::Result<Vec<_>> = reset.into_iter().collect();
-        for (world, new) in reset.map_err(|error| raise(py, &error))? {
-            *world = new;
+        let reset: anyhow::Result<Vec<_>> = reset?.into_iter().collect();
+        for (world, step, new) in reset.map_err(|error| raise(py, &error))? {
+            (*world, *step) = (new, Some(0));
         }
         Ok(())
     }
@@ -200,26 +253,26 @@ impl Estimators {
         chosen: PyReadonlyArray1<'_, bool>,
     ) -> PyResult<()> {
         let mut state = self.state(py)?;
-        let frames = self.frames(py, frames.as_array(), chosen.as_slice()?)?;
-        let State { worlds, threads } = &mut *state;
-        let is_short = self.origin.is_short(worlds.len());
-        let n_numbers = worlds.len() * self.n_numbers();
-        let corrected = detached(py, n_numbers, || {
-            threads.work(is_short, |threads| {
-                threads.each(worlds.iter_mut().zip(frames), |(world, frame)| {
-                    frame.map_or(Ok(()), |frame| world.correct(&frame))
-                })
-            })
+        let chosen = chosen.as_slice()?;
+        let frames = self.frames(py, frames.as_array(), chosen)?;
+        let State {
+            worlds,
+            steps,
+            threads,
+        } = &mut *state;
+        let tasks = worlds.iter_mut().zip(frames).enumerate();
+        let is_short = self.origin.is_short(self.n_worlds);
+        let corrected = self.each(py, threads, is_short, tasks, |(index, (world, frame))| {
+            let corrected = world.correct(&frame?);
+            Some((index, corrected.err()?))
         });
-        let n_worlds = corrected.len();
-        let refused = corrected.into_iter().enumerate();
-        let refused = refused.filter_map(|(world, result)| Some((world, result.err()?)));
-        let (refused, errors): (Vec<usize>, Vec<_>) = refused.unzip();
+        let refused = corrected.inspect_err(|_| forget(steps, chosen))?;
+        let (refused, errors): (Vec<usize>, Vec<_>) = refused.into_iter().flatten().unzip();
         let Some(first) = errors.into_iter().next() else {
             return Ok(());
         };
         let error = anyhow::Error::from(first);
-        let error = if n_worlds > 1 {
+        let error = if self.n_worlds > 1 {
             error.context(named(&refused))
         } else {
             error
@@ -235,15 +288,19 @@ impl Estimators {
     fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
-        let State { worlds, threads } = &mut *state;
-        let is_short = self.origin.is_short(worlds.len());
-        let worlds = worlds.iter_mut().zip(chosen);
-        let worlds = worlds.filter_map(|(world, &chosen)| chosen.then_some(&mut **world));
-        let worlds: Vec<&mut dyn Estimator> = worlds.collect();
-        let n_numbers = worlds.len() * self.n_numbers();
-        detached(py, n_numbers, || {
-            threads.work(is_short, |threads| self.predict_all(worlds, threads));
-        });
+        let State {
+            worlds,
+            steps,
+            threads,
+        } = &mut *state;
+        let tasks = worlds.iter_mut().zip(chosen);
+        let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
+        let is_short = self.origin.is_short(self.n_worlds);
+        let predicted = self.each(py, threads, is_short, tasks, |world| world.predict());
+        predicted.inspect_err(|_| forget(steps, chosen))?;
+        for (step, &chosen) in steps.iter_mut().zip(chosen) {
+            *step = step.map(|step| step + u64::from(chosen));
+        }
         Ok(())
     }
 
@@ -255,7 +312,7 @@ impl Estimators {
         states: PyReadonlyArray3<'py, u8>,
         target: usize,
     ) -> PyResult<(Numbers<'py>, Numbers<'py>, Numbers<'py>)> {
-        let state = self.state(py)?;
+        let mut state = self.state(py)?;
         let states = states.as_array();
         let n_states = self.state_names.len();
         if let Some(got) = states.iter().find(|state| usize::from(**state) >= n_states) {
@@ -267,15 +324,18 @@ impl Estimators {
             ));
         }
         let truths: Vec<Grid<u8>> = states.outer_iter().map(|it| it.to_owned()).collect();
-        let figures = |figure: &dyn Fn(&Belief, &Grid<u8>) -> f64| {
-            let pairs = state.worlds.iter().zip(&truths);
-            let figures = pairs.map(|(world, truth)| figure(world.belief(), truth));
-            PyArray1::from_iter(py, figures)
-        };
-        let brier = |belief: &Belief, truth: &Grid<u8>| {
-            brier_score(belief, truth, target, self.target_state)
-        };
-        Ok((figures(&log_loss), figures(&brier), figures(&accuracy)))
+        let State {
+            worlds, threads, ..
+        } = &mut *state;
+        let tasks = worlds.iter_mut().zip(&truths);
+        let figures = self.each(py, threads, true, tasks, |(world, truth)| {
+            let belief = world.belief();
+            let brier = brier_score(belief, truth, target, self.target_state);
+            [log_loss(belief, truth), brier, accuracy(belief, truth)]
+        })?;
+        let [losses, briers, accuracies] =
+            [0, 1, 2].map(|it| PyArray1::from_iter(py, figures.iter().map(|all| all[it])));
+        Ok((losses, briers, accuracies))
     }
 
     /// Scores the beliefs' predictions of frames `[n, H, W]`. Returns the log-likelihood, summed over the observed
@@ -288,29 +348,35 @@ impl Estimators {
         let mut state = self.state(py)?;
         let all = vec![true; state.worlds.len()];
         let frames = self.frames(py, frames.as_array(), &all)?;
-        let State { worlds, threads } = &mut *state;
-        let scored = worlds.iter_mut().zip(frames.iter().flatten());
+        let State {
+            worlds, threads, ..
+        } = &mut *state;
+        let tasks = worlds.iter_mut().zip(frames.iter().flatten());
         let kind = self.origin.kind;
-        let scored = threads.work(self.origin.is_short(1), |_| {
-            let scores = scored.filter_map(|(world, frame)| {
-                let observation_model = kind.traits.observation_model?(&**world);
-                Some(score(
-                    world.belief(),
-                    &*observation_model.likelihood()?,
-                    frame,
-                ))
-            });
-            scores
-                .map(|score| (score.log_likelihood, score.n_seen as f64))
-                .unzip()
-        });
-        let (sums, seen): (Vec<f64>, Vec<f64>) = scored;
+        let is_short = self.origin.is_short(1);
+        let scored = self.each(py, threads, is_short, tasks, |(world, frame)| {
+            let observation_model = kind.traits.observation_model?(&**world);
+            let likelihood = observation_model.likelihood()?;
+            let score = score(world.belief(), &likelihood, frame);
+            Some((score.log_likelihood, score.n_seen as f64))
+        })?;
+        let (sums, seen): (Vec<f64>, Vec<f64>) = scored.into_iter().flatten().unzip();
         Ok((sums.into_pyarray(py), seen.into_pyarray(py)))
     }
 }
 
 impl Estimators {
-    fn new(py: Python<'_>, origin: Origin, n_worlds: usize) -> PyResult<Self> {
+    /// Builds the beliefs before the first frame. `n_worlds` is `None` for a single world without an axis for worlds.
+    fn new(py: Python<'_>, origin: Origin, n_worlds: Option<usize>) -> PyResult<Self> {
+        Self::of(
+            py,
+            Arc::new(origin),
+            n_worlds.unwrap_or(1),
+            n_worlds.is_none(),
+        )
+    }
+
+    fn of(py: Python<'_>, origin: Arc<Origin>, n_worlds: usize, is_single: bool) -> PyResult<Self> {
         let kind = origin.kind;
         let conditions = origin.conditions();
         let names = kind
@@ -325,26 +391,130 @@ impl Estimators {
             let observation_model = kind.traits.observation_model?(&**first?);
             Some(observation_model.likelihood()?.ncols())
         });
+        let steps = vec![Some(0); n_worlds];
         Ok(Self {
             kind: kind.name,
             n_observations: of_model.or(of_belief).unwrap_or(state_names.len()),
             state_names,
             target_state,
             n_worlds,
+            is_single,
             shape: origin.shape,
-            state: Mutex::new(State { worlds, threads }),
+            state: Mutex::new(State {
+                worlds,
+                steps,
+                threads,
+            }),
             origin,
         })
     }
 
-    /// Predicts the beliefs about some worlds, in one batch if the kind of belief supports it.
-    fn predict_all(&self, mut worlds: Vec<&mut dyn Estimator>, threads: Threads) {
-        match self.origin.kind.traits.predict_together {
-            Some(together) => together(worlds),
-            None => {
-                threads.each(worlds.iter_mut(), |world| world.predict());
-            }
+    /// Returns the number of predictions and the state of each world, and the description of the states' format.
+    fn saved(&self, py: Python<'_>) -> PyResult<(Vec<u64>, Vec<Vec<u8>>, String)> {
+        let Some(handover) = self.origin.kind.traits.handover else {
+            let got = format!("'{}', which cannot", self.kind);
+            return Err(invalid(
+                py,
+                "belief",
+                "a kind that can be copied and saved",
+                got,
+            ));
+        };
+        let mut state = self.state(py)?;
+        let State {
+            worlds,
+            steps,
+            threads,
+        } = &mut *state;
+        let first = handover(&*worlds[0]);
+        let what = format_args!("a copy of the beliefs about {} worlds", self.n_worlds);
+        check_memory(
+            py,
+            what,
+            self.n_worlds.saturating_mul(2 * first.to_bytes().len()),
+        )?;
+        let format = first.kind();
+        let is_short = self.origin.is_short(self.n_worlds);
+        let worlds = self.each(py, threads, is_short, worlds.iter_mut(), |world| {
+            handover(&**world).to_bytes()
+        })?;
+        Ok((steps.iter().flatten().copied().collect(), worlds, format))
+    }
+
+    fn encoded(&self, py: Python<'_>) -> PyResult<Vec<u8>> {
+        let (steps, worlds, format) = self.saved(py)?;
+        let (height, width) = self.shape.dim();
+        let prior = self.origin.prior.as_ref().map(Belief::to_bytes);
+        let saved = Saved {
+            header: Header {
+                kind: self.kind.into(),
+                model: self.origin.model_text.clone(),
+                dim: (self.state_names.len(), height, width),
+                is_single: self.is_single,
+                format,
+                steps,
+            },
+            prior: prior.as_deref().unwrap_or_default(),
+            checkpoint: &self.origin.checkpoint,
+            worlds: worlds.iter().map(Vec::as_slice).collect(),
+        };
+        Ok(py.detach(|| saved.to_bytes()))
+    }
+
+    /// Restores the states of all worlds from those of beliefs with the same sources.
+    fn restore<W: AsRef<[u8]> + Sync>(
+        &self,
+        py: Python<'_>,
+        n_predictions: &[u64],
+        saved: &[W],
+    ) -> PyResult<()> {
+        let Some(handover) = self.origin.kind.traits.handover_mut else {
+            return Err(self.unlike(py));
+        };
+        let mut state = self.state(py)?;
+        let State {
+            worlds,
+            steps,
+            threads,
+        } = &mut *state;
+        let is_short = self.origin.is_short(self.n_worlds);
+        let tasks = worlds.iter_mut().zip(saved);
+        let restored = self.each(py, threads, is_short, tasks, |(world, saved)| {
+            handover(&mut **world).restore(saved.as_ref())
+        })?;
+        if restored.contains(&false) {
+            return Err(self.unlike(py));
         }
+        *steps = n_predictions.iter().copied().map(Some).collect();
+        Ok(())
+    }
+
+    fn unlike(&self, py: Python<'_>) -> PyErr {
+        let expected = format!("the state of a belief '{}'", self.kind);
+        invalid(
+            py,
+            "belief",
+            expected,
+            "another, or one whose prediction failed",
+        )
+    }
+
+    /// Applies `work` to each task, unless a signal handler raises an exception meanwhile.
+    ///
+    /// # Errors
+    /// That exception. Some tasks are then done, and others are not.
+    fn each<T: Send, U: Send>(
+        &self,
+        py: Python<'_>,
+        threads: &mut Pool,
+        is_short: bool,
+        tasks: impl Iterator<Item = T>,
+        work: impl Fn(T) -> U + Sync + Send,
+    ) -> PyResult<Vec<U>> {
+        let tasks: Vec<T> = tasks.collect();
+        let n_numbers = tasks.len() * self.n_numbers();
+        let done = detached(py, n_numbers, || threads.each(is_short, tasks, work));
+        done.ok_or_else(raised)
     }
 
     /// Returns the number of probabilities in the belief about one world.
@@ -355,8 +525,21 @@ impl Estimators {
     /// Locks the estimators for this thread.
     ///
     /// # Errors
-    /// If another thread is using them.
+    /// If another thread is using them, or a signal interrupted an earlier call.
     fn state(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
+        let state = self.locked(py)?;
+        let worlds = 0..self.n_worlds;
+        let unknown: Vec<usize> = worlds.filter(|&it| state.steps[it].is_none()).collect();
+        if unknown.is_empty() {
+            return Ok(state);
+        }
+        let worlds = named(&unknown);
+        let problem = format!("belief: an interrupted call left {worlds} unfinished: reset first");
+        Err(failed(py, &problem, "interrupted"))
+    }
+
+    /// Like [`Self::state`], but also locks unfinished beliefs.
+    fn locked(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
         match self.state.try_lock() {
             Ok(state) => Ok(state),
             Err(TryLockError::Poisoned(left)) => Ok(left.into_inner()),
@@ -397,6 +580,12 @@ impl Estimators {
         let expected = format!("a value below {n_observations}, or 255");
         invalid(py, subject, expected, value)
     }
+}
+
+/// Marks the chosen worlds after an interrupted call.
+fn forget(steps: &mut [Option<u64>], chosen: &[bool]) {
+    let steps = steps.iter_mut().zip(chosen);
+    steps.filter(|it| *it.1).for_each(|(step, _)| *step = None);
 }
 
 /// Names worlds for an error: all, or the first eight and how many more.

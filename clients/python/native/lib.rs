@@ -24,6 +24,7 @@ mod reader;
 mod recording;
 mod refusal;
 mod samples;
+mod saved;
 mod threads;
 mod windows;
 mod wire;

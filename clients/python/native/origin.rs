@@ -1,17 +1,21 @@
 //! The sources that beliefs are built from: a model and a first belief, or a checkpoint.
 
-use crate::errors::check_memory;
+use crate::errors::{check_memory, raised, warn};
+use crate::model::{model_of, shape_of};
 use crate::prior::vanishing;
 use crate::refusal::{invalid, refused};
+use crate::saved::Saved;
 use crate::threads::Pool;
-use emberwatch_acting::beliefs::{BELIEFS, BeliefKind, Conditions, Input, KNOWN, named};
-use emberwatch_acting::learned::Learned;
+use emberwatch_acting::beliefs::{BELIEFS, BeliefKind, Conditions, Input, KNOWN, WorldForm, named};
+use emberwatch_acting::learned::{Learned, WorldNames};
+use emberwatch_acting::options::usual;
 use emberwatch_belief::estimation::belief::{Belief, BeliefError};
 use emberwatch_belief::estimation::estimator::Estimator;
 use emberwatch_learning::checkpoint::read_bytes;
 use emberwatch_learning::learners;
 use emberwatch_model::{Model, ModelError, Shape};
 use pyo3::prelude::*;
+use pyo3::types::PyString;
 use std::borrow::Cow;
 use std::path::PathBuf;
 
@@ -22,8 +26,12 @@ const TABLE_BYTES: usize = 4096;
 pub struct Origin {
     pub kind: &'static BeliefKind,
     pub model: Option<Model>,
+    /// The model's file, from which a saved belief reads it again.
+    pub model_text: Option<String>,
     pub prior: Option<Belief>,
     pub learned: Learned,
+    /// The file of the learned values. Empty if nothing was learned.
+    pub checkpoint: Vec<u8>,
     pub shape: Shape,
 }
 
@@ -45,6 +53,94 @@ pub fn belief_kinds() -> Vec<(&'static str, Facts)> {
 }
 
 impl Origin {
+    /// Creates the source of beliefs with a known model, whose first belief is `prior`.
+    pub fn known(
+        py: Python<'_>,
+        model_text: &str,
+        prior: Belief,
+        kind: &'static BeliefKind,
+    ) -> PyResult<Self> {
+        let (model, dim) = (model_of(model_text)?, prior.probabilities().dim());
+        if dim.0 != model.n_states() {
+            let expected = format!("shape ({}, H, W)", model.n_states());
+            return Err(invalid(py, "prior", expected, format!("{dim:?}")));
+        }
+        Ok(Self {
+            kind,
+            model: Some(model),
+            model_text: Some(model_text.into()),
+            shape: prior.shape(),
+            prior: Some(prior),
+            learned: Learned::default(),
+            checkpoint: Vec::new(),
+        })
+    }
+
+    /// Creates the source of beliefs from the bytes of a checkpoint, which `name` names in errors.
+    pub fn learned(
+        py: Python<'_>,
+        name: &str,
+        checkpoint: Vec<u8>,
+        shape: Shape,
+        kind: Option<&'static BeliefKind>,
+        model_text: Option<&str>,
+    ) -> PyResult<Self> {
+        let model = model_text.map(model_of).transpose()?;
+        let learned = decoded(py, name, &checkpoint)?;
+        let kind = kind.unwrap_or_else(|| usual(&learned));
+        if kind.learned_by.is_none() {
+            let got = format!("decisions on the belief '{}': use known(model)", kind.name);
+            return Err(invalid(py, "checkpoint", "a learned belief", got));
+        }
+        let form = model.as_ref().map(|model| WorldForm::of(model, shape));
+        let fits = form.map_or(Ok(()), |form| kind.check(&learned, &form));
+        fits.map_err(|error| refused(py, format!("{error:#}")))?;
+        Ok(Self {
+            kind,
+            model,
+            model_text: model_text.map(Into::into),
+            prior: None,
+            learned,
+            checkpoint,
+            shape,
+        })
+    }
+
+    /// Reads the sources of a saved belief.
+    pub fn saved(py: Python<'_>, saved: &Saved<'_>) -> PyResult<Self> {
+        let (header, is_learned) = (&saved.header, !saved.checkpoint.is_empty());
+        let (_, height, width) = header.dim;
+        let shape = shape_of(py, height, width)?;
+        let kind = kind_of(PyString::new(py, &header.kind).as_any(), is_learned)?;
+        let (model, prior) = (
+            header.model.as_deref(),
+            Belief::from_bytes(saved.prior, header.dim),
+        );
+        if is_learned {
+            let checkpoint = saved.checkpoint.to_vec();
+            return Self::learned(
+                py,
+                "of a saved belief",
+                checkpoint,
+                shape,
+                Some(kind),
+                model,
+            );
+        }
+        let Some((model, prior)) = model.zip(prior) else {
+            let expected = "a saved belief with a model and a first belief";
+            return Err(invalid(py, "belief", expected, "one without"));
+        };
+        Self::known(py, model, prior, kind)
+    }
+
+    /// Warns if the values were learned in worlds with other names than the model's.
+    pub fn warn_of_other_worlds(&self, py: Python<'_>) -> PyResult<()> {
+        let names = self.model.as_ref().map(WorldNames::of);
+        let warning = names.and_then(|names| self.learned.warning_in(&names));
+        warning.map_or(Ok(()), |warning| warn(py, warning))
+    }
+
     pub fn conditions(&self) -> Conditions<'_> {
         Conditions {
             shape: self.shape,
@@ -62,7 +158,8 @@ impl Origin {
     /// Builds the beliefs about `n_worlds` worlds, each with `n_states` states.
     ///
     /// # Errors
-    /// If there is not enough memory, or if the model or checkpoint provides no belief on this grid.
+    /// If there is not enough memory, if the model or checkpoint provides no belief on this grid, or if a signal handler
+    /// raises an exception.
     pub fn estimators(
         &self,
         py: Python<'_>,
@@ -88,11 +185,10 @@ impl Origin {
         let saved = saved.map_or(0, |it| it(&*first).to_bytes().len());
         let belief = size_of_val(first.belief().as_slice());
         memory(TABLE_BYTES + 8 * belief + 2 * saved)?;
-        let others = py.detach(|| {
-            threads.work(self.is_short(n_worlds), |threads| {
-                threads.each(1..n_worlds, |_| self.estimator())
-            })
-        });
+        let tasks = (1..n_worlds).collect();
+        let others =
+            py.detach(|| threads.each(self.is_short(n_worlds), tasks, |_| self.estimator()));
+        let others = others.ok_or_else(raised)?;
         let worlds: anyhow::Result<Vec<_>> = std::iter::once(Ok(first)).chain(others).collect();
         worlds.map_err(|error| unfit(py, &error))
     }

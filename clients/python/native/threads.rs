@@ -1,7 +1,14 @@
 //! A thread pool for work on several worlds at once.
 
+use crate::errors::interrupted;
 use emberwatch_acting::parallel::in_parallel;
 use rayon::{ThreadPool, ThreadPoolBuilder};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::{Duration, Instant};
+
+/// Time between two checks for signals. Shorter calls are not interrupted.
+const LOOK: Duration = Duration::from_millis(50);
 
 /// A thread pool that belongs to one object. A global pool would be unusable after a fork, which copies no threads.
 #[derive(Default)]
@@ -22,19 +29,66 @@ impl Pool {
     /// Runs `work` on the threads of the pool, which the first call in a process starts. If `is_short` is set, runs it
     /// on this thread, because sharing such short work would cost more time than it saves.
     pub fn work<R: Send>(&mut self, is_short: bool, work: impl FnOnce(Threads) -> R + Send) -> R {
+        match self.threads(is_short) {
+            Some(threads) => threads.install(|| work(Threads::Several)),
+            None => work(Threads::One),
+        }
+    }
+
+    /// Applies `work` to each task as [`Threads::each`] does, while this thread handles signals. Returns `None` if a
+    /// signal handler raised an exception. Tasks that had not begun by then are dropped.
+    pub fn each<T: Send, U: Send>(
+        &mut self,
+        is_short: bool,
+        tasks: Vec<T>,
+        work: impl Fn(T) -> U + Sync,
+    ) -> Option<Vec<U>> {
+        let Some(threads) = self.threads(is_short) else {
+            let mut looked = Instant::now();
+            let unless_interrupted = |task| {
+                if looked.elapsed() >= LOOK {
+                    looked = Instant::now();
+                    if interrupted() {
+                        return None;
+                    }
+                }
+                Some(work(task))
+            };
+            return tasks.into_iter().map(unless_interrupted).collect();
+        };
+        let is_over = AtomicBool::new(false);
+        let (sender, receiver) = channel();
+        threads.in_place_scope(|scope| {
+            let unless_over = |task| (!is_over.load(Ordering::Relaxed)).then(|| work(task));
+            scope.spawn(move |_| {
+                // After an interrupt, nobody receives the results.
+                let _ = sender.send(in_parallel(tasks, unless_over));
+            });
+            loop {
+                match receiver.recv_timeout(LOOK) {
+                    Ok(results) => return results.into_iter().collect(),
+                    Err(RecvTimeoutError::Timeout) if !interrupted() => {}
+                    // If a task panicked, the scope passes the panic to this thread.
+                    Err(_) => {
+                        is_over.store(true, Ordering::Relaxed);
+                        return None;
+                    }
+                }
+            }
+        })
+    }
+
+    /// Returns the pool's threads; `None` if the work is short, or if the system could not start threads.
+    fn threads(&mut self, is_short: bool) -> Option<&ThreadPool> {
         if is_short {
-            return work(Threads::One);
+            return None;
         }
         self.forget_others();
         if self.threads.is_none() {
             self.pid = std::process::id();
             self.threads = ThreadPoolBuilder::new().build().ok();
         }
-        match &self.threads {
-            Some(threads) => threads.install(|| work(Threads::Several)),
-            // The system could not start the pool's threads.
-            None => work(Threads::One),
-        }
+        self.threads.as_ref()
     }
 
     /// In a forked child, forgets the parent's threads. They do not run here, and dropping the pool would wait for

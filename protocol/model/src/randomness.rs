@@ -38,6 +38,8 @@ pub enum Purpose {
     Replay,
     /// A learned policy's random actions; indexed by step.
     Exploration,
+    /// The states that are drawn from a belief; indexed by world.
+    Sample,
 }
 
 impl Purpose {
@@ -57,6 +59,7 @@ impl Purpose {
             Self::Hidden => b"hidden",
             Self::Replay => b"replay",
             Self::Exploration => b"exploration",
+            Self::Sample => b"sample",
         }
     }
 }

@@ -20,6 +20,8 @@ pub struct BeliefKind {
     pub knows_model: bool,
     /// Whether a DQN can learn to choose options on it.
     pub has_options: bool,
+    /// Whether the belief is about each cell's next observation instead of its state.
+    pub of_observations: bool,
     /// Whether a single estimator divides its work among threads.
     pub is_parallel: bool,
     /// The learner of this kind. `None` if nothing is learned.

@@ -31,6 +31,7 @@ pub const NEURAL: BeliefKind = BeliefKind {
     input: Input::Frames,
     knows_model: false,
     has_options: true,
+    of_observations: true,
     is_parallel: true,
     learned_by: Some(LearnedBy {
         learner: "neural",
@@ -55,6 +56,7 @@ pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
     about: "neural, converted to states by the true model's observation matrix",
     knows_model: true,
     has_options: false,
+    of_observations: false,
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
         let model = model.context("checkpoint: expected a learned neural belief, got none")?;
@@ -252,6 +254,9 @@ impl Handover for NeuralEstimator {
     }
 
     fn to_bytes(&self) -> Vec<u8> {
+        if self.failure.is_some() {
+            return Vec::new();
+        }
         let filter = self.filter.as_ref();
         let filter = filter.map_or(Vec::new(), |it| it.to_bytes());
         [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()

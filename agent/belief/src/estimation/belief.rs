@@ -7,6 +7,8 @@
 use emberwatch_model::Model;
 use emberwatch_model::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
 use ndarray::{ArrayView2, ArrayView3, Axis};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -186,6 +188,34 @@ impl Belief {
             }
         }
         Grid::from_shape_vec(self.shape.dim(), entropy).expect("invariant: one value per cell")
+    }
+
+    /// Draws each cell's state from the cell's own distribution, shape `[H, W]`.
+    ///
+    /// # Panics
+    /// If there are more than 256 states.
+    pub fn sample(&self, rng: &mut ChaCha8Rng) -> Grid<u8> {
+        let (cells, n_states) = (0..self.shape.n_cells(), self.n_states());
+        assert!(n_states <= 256, "belief: expected states that fit a byte");
+        let (numbers, n_cells) = (self.as_slice(), cells.len());
+        let state = |cell: usize| {
+            let states = numbers[cell..].iter().step_by(n_cells);
+            let states = states.map(|&p| f64::from(p)).enumerate();
+            // The sum may differ from 1 by rounding.
+            let total: f64 = states.clone().map(|(_, p)| p).sum();
+            let mut left = (rng.next_u64() >> 11) as f64 * 2f64.powi(-53) * total;
+            let mut last = 0;
+            for (state, p) in states.filter(|it| it.1 > 0.0) {
+                last = state;
+                if left < p {
+                    break;
+                }
+                left -= p;
+            }
+            last as u8
+        };
+        let states = cells.map(state).collect();
+        Grid::from_shape_vec(self.shape.dim(), states).expect("invariant: one state per cell")
     }
 
     /// Returns the probabilities, shape `[S, H, W]`, row-major.

@@ -39,13 +39,13 @@ pub trait Filter: Estimator + ObservationModel + Handover {}
 
 impl<T: Estimator + ObservationModel + Handover> Filter for T {}
 
-/// An estimator whose state can be saved as bytes after the prediction of X_{k+1}, and restored by another estimator of
-/// the same kind. Estimators are copied and handed over this way, too.
+/// An estimator whose state can be saved as bytes, and restored by another estimator of the same kind. Estimators are copied and handed over this way, too.
 pub trait Handover {
     /// Returns a description of the byte format. Only estimators with the same description can read the bytes.
     fn kind(&self) -> String;
 
-    /// Returns the belief, `[S, H, W]` as `f32`, followed by any data that is specific to the kind.
+    /// Returns the belief, `[S, H, W]` as `f32`, followed by any data that is specific to the kind. Empty after a failed
+    /// prediction: no estimator restores that.
     fn to_bytes(&self) -> Vec<u8>;
 
     /// Restores the state from the bytes of an estimator of the same kind. Returns false and changes nothing if the

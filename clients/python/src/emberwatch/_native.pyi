@@ -345,7 +345,9 @@ class Flights:
 class Lease:
     """The right to fly consecutive robots, and the step k of each of their worlds."""
 
-    def __init__(self, server: Connection, number: int, first_robot: int, n_robots: int) -> None: ...
+    def __init__(
+        self, server: Connection, number: int, first_robot: int, n_robots: int
+    ) -> None: ...
     def step(
         self, paths: ArrayLike, first_robot: int, n_robots: int, flags: int, seconds: float
     ) -> Answer | None:
@@ -471,18 +473,38 @@ class Estimators:
     """
 
     @staticmethod
-    def known(model: str, prior: NDArray[np.float32], kind: str, n_worlds: int) -> Estimators:
+    def known(
+        model: str, prior: NDArray[np.float32], kind: str, n_worlds: int | None
+    ) -> Estimators:
         """Builds beliefs from a model file's text. All worlds share the `prior`, `(S, H, W)`."""
 
     @staticmethod
     def load(
-        checkpoint: str,
-        grid: tuple[int, int],
+        file: str,
+        grid: tuple[int, int] | None,
         kind: str | None,
         model: str | None,
-        n_worlds: int,
+        n_worlds: int | None,
     ) -> Estimators:
-        """Loads beliefs; `grid` is height and width, `model` a model file's text."""
+        """Loads beliefs; `grid` is height and width, `model` a model file's text.
+
+        A file of `save` takes no other arguments.
+        """
+
+    def copy(self) -> Estimators: ...
+    def to_bytes(self) -> bytes: ...
+    @staticmethod
+    def from_bytes(bytes: bytes) -> Estimators: ...
+    def save(self, file: str) -> None: ...
+    def steps(self) -> list[int | None]:
+        """Returns the number of predictions of each world; None after an interrupted call."""
+
+    def sample(self, seed: int) -> NDArray[np.uint8]:
+        """Returns states drawn cell by cell, as a new array, `(n, H, W)`."""
+
+    @property
+    def is_single(self) -> bool:
+        """Whether arrays have no axis for worlds."""
 
     @property
     def kind(self) -> str: ...

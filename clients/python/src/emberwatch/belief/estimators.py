@@ -3,9 +3,10 @@
 `known` makes a `Belief` from a model, `load` makes one from a checkpoint.
 """
 
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +18,7 @@ from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
 
-_Number = TypeVar("_Number", np.float32, np.float64)
+_Number = TypeVar("_Number", np.float32, np.float64, np.uint8)
 
 #: Maximum number of worlds of one belief.
 _MAX_WORLDS = 1 << 20
@@ -73,21 +74,22 @@ def known(
     """
     model = Model.named(model)
     numbers = distribution(prior, n_states=model.n_states).astype(np.float32)
-    n = _n_worlds(n_worlds)
-    native = _native.Estimators.known(model.toml, numbers, kind, n)
-    return Belief(native, is_single=n_worlds is None)
+    return Belief(_native.Estimators.known(model.toml, numbers, kind, _n_worlds(n_worlds)))
 
 
 def load(
     checkpoint: str | PathLike[str],
     *,
-    height: int,
-    width: int,
+    height: int | None = None,
+    width: int | None = None,
     kind: str | None = None,
     model: Model | str | Path | None = None,
     n_worlds: int | None = None,
 ) -> "Belief":
-    """Loads a learned belief from a checkpoint of `emberwatch-agent train`.
+    """Loads a learned belief from a checkpoint of `emberwatch-agent train`, or a saved belief.
+
+    A file of `Belief.save` is loaded by its path alone, and continues in the state in which it was
+    saved: ``load("noon.belief")``. Everything below is about checkpoints.
 
     A learned belief has its own order of states: `Belief.state_names` are ``"state 0"`` and so on,
     and `Belief.target_state` is the number of the state that pays most. A neural belief predicts
@@ -96,7 +98,7 @@ def load(
 
     Args:
         checkpoint: Path of the file. Filters and neural beliefs fit any grid, an autoencoder only
-            the grid that it was trained on.
+            the grid that it was trained on. A checkpoint requires `height` and `width`.
         height: Rows of the grid.
         width: Columns of the grid.
         kind: A learned kind of `kinds`, such as ``"learned+spatial"``. None: the kind that the
@@ -108,17 +110,17 @@ def load(
 
     Raises:
         InvalidArgumentError: If the file is not a complete checkpoint, does not fit the kind, the
-            grid or the model, or contains decisions trained on the belief of a known model.
+            grid or the model, or contains decisions trained on the belief of a known model. If the
+            file is a damaged saved belief, or a saved belief is given other arguments.
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
-    grid = tuple(
-        as_count(side, name, 1, _native.MAX_SIDE)
-        for side, name in ((height, "height"), (width, "width"))
-    )
+    grid = None
+    if height is not None or width is not None:
+        rows = as_count(height, "height", 1, _native.MAX_SIDE)
+        grid = rows, as_count(width, "width", 1, _native.MAX_SIDE)
     toml = None if model is None else Model.named(model).toml
     path, n = utf8("checkpoint", checkpoint), _n_worlds(n_worlds)
-    native = _native.Estimators.load(path, (grid[0], grid[1]), kind, toml, n)
-    return Belief(native, is_single=n_worlds is None)
+    return Belief(_native.Estimators.load(path, grid, kind, toml, n))
 
 
 class Belief:
@@ -136,13 +138,73 @@ class Belief:
       unless `keep_correlations` is true. It never discards correlations that were loaded from a
       checkpoint.
 
+    - `copy.copy`, `copy.deepcopy` and `pickle` make independent copies, as `copy` does. A pickle
+      has everything that the belief needs: the model or the checkpoint, the first belief, and the
+      state. An autoencoder's belief cannot be copied or saved: `InvalidArgumentError`.
+    - Signals such as Ctrl-C end every call about many worlds, between two worlds. The worlds of an
+      unfinished `correct` or `predict` then refuse all calls with an `EmberwatchError`, code
+      ``"interrupted"``, until `reset`.
+
     Only one thread at a time may use a belief.
     """
 
-    def __init__(self, native: _native.Estimators, *, is_single: bool) -> None:
+    def __init__(self, native: _native.Estimators) -> None:
         """Wraps a native object; call `known` or `load` instead."""
-        self._native, self._is_single = native, is_single
+        self._native, self._is_single = native, native.is_single
         self._shape = native.shape
+
+    def __repr__(self) -> str:
+        """Shows kind, shape, worlds and step: the number of predictions since the first belief."""
+        steps = set(self._native.steps())
+        known_steps = sorted(step for step in steps if step is not None)
+        ends = dict.fromkeys([*known_steps[:1], *known_steps[-1:]])
+        step = "unfinished" if None in steps else " to ".join(map(str, ends))
+        return f"Belief({self.kind!r}, shape={self.shape}, worlds={self._shape[0]}, step={step})"
+
+    def __copy__(self) -> "Belief":
+        return self.copy()
+
+    def __deepcopy__(self, memo: object) -> "Belief":
+        return self.copy()
+
+    def __reduce__(self) -> tuple[Callable[[bytes], "Belief"], tuple[bytes]]:
+        return _from_bytes, (self._native.to_bytes(),)
+
+    def copy(self) -> "Belief":
+        """Returns an independent copy in the same state.
+
+        Raises:
+            InvalidArgumentError: If the kind cannot be copied, as ``"autoencoder"``.
+            NotEnoughMemoryError: If the copy does not fit in memory.
+        """
+        return Belief(self._native.copy())
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes the belief to a file for `load`, completely or not at all.
+
+        Raises:
+            InvalidArgumentError: If the kind cannot be saved, as ``"autoencoder"``, or the file
+                cannot be written.
+        """
+        self._native.save(utf8("path", path))
+
+    def sample(self, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """Draws the state of each cell from the cell's own distribution.
+
+        Draws one integer from `rng`, so equal generators give equal samples. Correlations between
+        cells are not sampled.
+
+        Returns:
+            Indices of states, shape (H, W), or (n_worlds, H, W).
+
+        Raises:
+            InvalidArgumentError: If the belief is about observations instead of states
+                (``"neural"``), or `rng` is not a NumPy generator.
+        """
+        if not isinstance(cast("object", rng), np.random.Generator):
+            raise invalid("rng", "a numpy.random.Generator", repr_of(rng))
+        seed = int(rng.integers(2**64, dtype=np.uint64))
+        return self._of_worlds(self._native.sample(seed))
 
     @property
     def kind(self) -> str:
@@ -286,5 +348,10 @@ def target_of(belief: Belief, target: int | None) -> int:
     raise invalid("target", expected, repr_of(target))
 
 
-def _n_worlds(n_worlds: int | None) -> int:
-    return 1 if n_worlds is None else as_count(n_worlds, "n_worlds", 1, _MAX_WORLDS)
+def _n_worlds(n_worlds: int | None) -> int | None:
+    return None if n_worlds is None else as_count(n_worlds, "n_worlds", 1, _MAX_WORLDS)
+
+
+def _from_bytes(saved: bytes) -> Belief:
+    """Restores a pickled belief."""
+    return Belief(_native.Estimators.from_bytes(saved))
