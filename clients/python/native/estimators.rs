@@ -19,8 +19,10 @@ use emberwatch_model::{Frame, Grid, Model, Shape};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
+use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::PyTuple;
 use std::any::Any;
+use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
@@ -192,6 +194,32 @@ impl Estimators {
         Ok(())
     }
 
+    /// Returns the state of the belief about each world, for [`Self::restore`], which continues bit for bit.
+    fn to_bytes(&self, py: Python<'_>) -> PyResult<Vec<Cow<'static, [u8]>>> {
+        let handover = self.origin.kind.traits.handover;
+        let handover = handover.ok_or_else(|| self.not_kept(py))?;
+        let state = self.state(py)?;
+        let worlds = state.worlds.iter();
+        Ok(worlds
+            .map(|world| handover(&**world).to_bytes().into())
+            .collect())
+    }
+
+    /// Restores the beliefs about all worlds from `to_bytes` of beliefs of the same kind. If the bytes do not fit,
+    /// earlier worlds may have changed.
+    fn restore(&self, py: Python<'_>, worlds: Vec<PyBackedBytes>) -> PyResult<()> {
+        let handover = self.origin.kind.traits.handover_mut;
+        let handover = handover.ok_or_else(|| self.not_kept(py))?;
+        let mut state = self.state(py)?;
+        let pairs = state.worlds.iter_mut().zip(&worlds);
+        let mut restored = pairs.map(|(world, bytes)| handover(&mut **world).restore(bytes));
+        if worlds.len() == self.n_worlds && restored.all(|fits| fits) {
+            return Ok(());
+        }
+        let expected = format!("states of {} beliefs '{}'", self.n_worlds, self.kind);
+        Err(invalid(py, "belief", expected, "others"))
+    }
+
     /// Corrects the beliefs about the chosen worlds with their frames. `frames`, `[n, H, W]`, has one frame per world.
     fn correct(
         &self,
@@ -350,6 +378,11 @@ impl Estimators {
     /// Returns the number of probabilities in the belief about one world.
     fn n_numbers(&self) -> usize {
         self.state_names.len() * self.shape.n_cells()
+    }
+
+    /// Creates the exception for a kind whose state cannot be saved.
+    fn not_kept(&self, py: Python<'_>) -> PyErr {
+        invalid(py, "belief", "a kind whose state can be saved", self.kind)
     }
 
     /// Locks the estimators for this thread.

@@ -209,6 +209,12 @@ class Connection:
         Refused on a connection to a server.
         """
 
+    def snapshot(self) -> bytes:
+        """Returns the state of all worlds in this process; refused on a connection to a server."""
+
+    def restore(self, bytes: bytes) -> None:
+        """Replaces all worlds in this process with those of `snapshot`; refuses other worlds."""
+
     @property
     def info(self) -> str:
         """The server's reply to `hello`, as JSON."""
@@ -345,7 +351,9 @@ class Flights:
 class Lease:
     """The right to fly consecutive robots, and the step k of each of their worlds."""
 
-    def __init__(self, server: Connection, number: int, first_robot: int, n_robots: int) -> None: ...
+    def __init__(
+        self, server: Connection, number: int, first_robot: int, n_robots: int
+    ) -> None: ...
     def step(
         self, paths: ArrayLike, first_robot: int, n_robots: int, flags: int, seconds: float
     ) -> Answer | None:
@@ -464,6 +472,18 @@ def description_with_radius(text: str, radius: int) -> str:
 def read_description(text: str) -> dict[str, Any]:
     """Returns the fields of `Description` except `toml`; `ValueError` if the text is invalid."""
 
+@final
+class Dynamics:
+    """The transition of worlds for one model on one grid; `Model.advance` checks the arguments."""
+
+    def __new__(cls, model: str, height: int, width: int) -> Dynamics:
+        """`model`: the text of a model file."""
+
+    def advance(
+        self, states: NDArray[np.uint8], seeds: NDArray[np.uint64], step: int
+    ) -> NDArray[np.uint8]:
+        """Returns the states one step later, `(n, H, W)`, as a new array; `seeds`: `(n,)`."""
+
 class Estimators:
     """Beliefs of one kind about n worlds; `Belief` checks the arguments.
 
@@ -507,6 +527,12 @@ class Estimators:
         """Corrects the beliefs about the chosen worlds; one frame for each world, `(n, H, W)`."""
 
     def predict(self, chosen: NDArray[np.bool_]) -> None: ...
+    def to_bytes(self) -> list[bytes]:
+        """Returns the state of the belief about each world."""
+
+    def restore(self, worlds: list[bytes]) -> None:
+        """Continues from `to_bytes` of beliefs of the same kind."""
+
     def scores(self, states: NDArray[np.uint8], target: int) -> tuple[_Doubles, _Doubles, _Doubles]:
         """Returns log loss, Brier score and accuracy for states `(n, H, W)`, `(n,)` each."""
 

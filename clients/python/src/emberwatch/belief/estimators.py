@@ -220,6 +220,14 @@ class Belief:
         """Predicts: moves the belief from X_k to X_{k+1} (eq. 6)."""
         self._native.predict(self._chosen(worlds))
 
+    def to_bytes(self) -> list[bytes]:
+        """Returns the state of the belief about each world after `predict`, for `restore`."""
+        return self._native.to_bytes()
+
+    def restore(self, worlds: list[bytes]) -> None:
+        """Continues, to the bit, from `to_bytes` of a belief of the same kind, model and shape."""
+        self._native.restore(worlds)
+
     def score_states(
         self, states: NDArray[np.uint8], *, target: int | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
