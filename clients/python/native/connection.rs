@@ -5,20 +5,22 @@ use crate::backend::{CheckedSettings, Worlds};
 use crate::errors::{raise, raise_of_channel};
 use crate::model::shape_of;
 use crate::owned::Owned;
-use crate::refusal::invalid;
+use crate::refusal::{invalid, refused};
 use crate::samples::{Truth, truth_of};
 use crate::wire;
+use anyhow::bail;
 use emberwatch_messages::backend::StepAnswer;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{StepRequest, WorldResult};
 use emberwatch_model::Shape;
-use emberwatch_sim::embedded::INSTANCE;
+use emberwatch_sim::embedded::{Embedded, INSTANCE};
 use emberwatch_sim::results::world_result;
 use emberwatch_sim::world::Episode;
 use numpy::ndarray::Array2;
 use pyo3::prelude::*;
+use std::borrow::Cow;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
@@ -94,6 +96,17 @@ impl Connection {
         Ok(truths.map(of).collect())
     }
 
+    /// Returns the state of all embedded worlds, for [`Self::restore`].
+    fn snapshot(&self, py: Python<'_>) -> PyResult<Cow<'static, [u8]>> {
+        let bytes = self.of_embedded(py, "clone_state", Embedded::snapshot)?;
+        Ok(bytes.into())
+    }
+
+    /// Replaces all embedded worlds with the worlds of a snapshot.
+    fn restore(&self, py: Python<'_>, bytes: &[u8]) -> PyResult<()> {
+        self.of_embedded(py, "restore_state", |worlds| worlds.restore(bytes))
+    }
+
     /// Sends a control request as JSON text. Returns the text of the answer. `what` names the request in errors.
     fn control(&self, py: Python<'_>, text: &[u8], what: &str, seconds: f64) -> PyResult<String> {
         let ask = |to: &mut Worlds| to.backend().control_text(text, duration(seconds));
@@ -143,6 +156,23 @@ impl Connection {
             nanos_of_robot: AtomicU64::new(0),
             info,
             worlds: Owned::new(instance, worlds),
+        })
+    }
+
+    /// Uses the worlds in this process. `what` names the caller in errors.
+    fn of_embedded<T: Send>(
+        &self,
+        py: Python<'_>,
+        what: &str,
+        act: impl FnOnce(&mut Embedded) -> anyhow::Result<T> + Send,
+    ) -> PyResult<T> {
+        let done = self.worlds.with(py, |worlds| match worlds {
+            Worlds::Embedded(own) => act(own),
+            Worlds::Served(_) => bail!("expected worlds in this process, got worlds of a server"),
+        })?;
+        done.map_err(|error| match error.downcast() {
+            Ok(lost) => raise(py, lost, what, 0.0),
+            Err(error) => refused(py, format!("{what}: {error:#}")),
         })
     }
 

@@ -5,6 +5,7 @@ mod answer;
 mod backend;
 mod connection;
 mod detached;
+mod dynamics;
 mod errors;
 mod estimators;
 mod flights;
@@ -57,6 +58,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<reader::Truths>()?;
     module.add_class::<reader::Outlooks>()?;
     module.add_class::<recording::Recording>()?;
+    module.add_class::<dynamics::Dynamics>()?;
     module.add_class::<estimators::Estimators>()?;
     module.add_class::<merit::MeritTally>()?;
     module.add_class::<options::Options>()?;

@@ -10,9 +10,9 @@ use crate::limits::{check_memory, n_threads, start};
 use crate::rate::Rate;
 use crate::simulator::{ClientId, Outcome, PendingFile, PendingReply, ResetJob, ServerStats};
 use crate::simulator::{Simulator, Stepped};
-use crate::snapshot::Job;
+use crate::snapshot::{Job, SnapshotError, decode};
 use crate::world::{Episode, Rules};
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::{Reply, ServerInfo};
 use emberwatch_messages::errors::{ConnectionError, check_status};
@@ -108,6 +108,48 @@ impl Embedded {
             found.push(simulator.episode(world)?);
             Some(found)
         }))
+    }
+
+    /// Encodes all worlds as the bytes of a snapshot.
+    ///
+    /// # Errors
+    /// If the worlds were shut down, one of them is being reset, or they are too large for a snapshot.
+    pub fn snapshot(&mut self) -> Result<Vec<u8>> {
+        let worlds = self.ready_worlds()?;
+        Ok(self.simulator.snapshot(worlds)?)
+    }
+
+    /// Replaces all worlds with the worlds of a snapshot, which continue exactly as the saved ones would have.
+    ///
+    /// # Errors
+    /// If the worlds were shut down, one of them is being reset, or the bytes are damaged or of other worlds. No world
+    /// has changed then.
+    pub fn restore(&mut self, bytes: &[u8]) -> Result<()> {
+        let worlds = self.ready_worlds()?;
+        let restored = decode(bytes)?.restore(self.simulator.spec())?;
+        if restored.len() != worlds.len() {
+            let expected = format!("{} worlds", worlds.len());
+            return Err(SnapshotError::n_worlds(expected, restored.len()).into());
+        }
+        let restored = worlds.zip(restored);
+        let jobs = restored.filter_map(|(world, it)| self.simulator.start_with(world, it));
+        let jobs = jobs.collect();
+        self.start(jobs);
+        Ok(())
+    }
+
+    /// Returns the range of all worlds.
+    ///
+    /// # Errors
+    /// If the worlds were shut down, or one of them is being reset.
+    fn ready_worlds(&mut self) -> Result<Range<usize>> {
+        let worlds = self.simulator.worlds();
+        let are_ready = self.episodes(worlds.clone())?.is_some();
+        ensure!(
+            are_ready,
+            "expected worlds after their burn-in, got one during it"
+        );
+        Ok(worlds)
     }
 
     /// Prepares for a request: installs worlds whose reset finished since the last call, and ends expired leases.

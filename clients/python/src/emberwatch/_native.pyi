@@ -209,6 +209,12 @@ class Connection:
         Refused on a connection to a server.
         """
 
+    def snapshot(self) -> bytes:
+        """Returns the state of all worlds in this process; refused on a connection to a server."""
+
+    def restore(self, bytes: bytes) -> None:
+        """Replaces all worlds in this process with those of `snapshot`; refuses other worlds."""
+
     @property
     def info(self) -> str:
         """The server's reply to `hello`, as JSON."""
@@ -465,6 +471,18 @@ def description_with_radius(text: str, radius: int) -> str:
 
 def read_description(text: str) -> dict[str, Any]:
     """Returns the fields of `Description` except `toml`; `ValueError` if the text is invalid."""
+
+@final
+class Dynamics:
+    """The transition of worlds for one model on one grid; `Model.advance` checks the arguments."""
+
+    def __new__(cls, model: str, height: int, width: int) -> Dynamics:
+        """`model`: the text of a model file."""
+
+    def advance(
+        self, states: NDArray[np.uint8], seeds: NDArray[np.uint64], step: int
+    ) -> NDArray[np.uint8]:
+        """Returns the states one step later, `(n, H, W)`, as a new array; `seeds`: `(n,)`."""
 
 class Estimators:
     """Beliefs of one kind about n worlds; `Belief` checks the arguments.

@@ -108,6 +108,17 @@ class ServerConnection(Connection):
         """Returns the hidden states of worlds in this process, as the fields of `Truth`."""
         return self._native.truths(worlds.start, len(worlds))
 
+    def clone_state(self) -> bytes:
+        """Returns the state of all worlds in this process."""
+        return self._native.snapshot()
+
+    def restore_state(self, worlds: bytes) -> None:
+        """Replaces all worlds in this process with those of `clone_state`.
+
+        Then call `Lease.observe`, from whose steps the next paths start.
+        """
+        self._native.restore(worlds)
+
     def lease(self, number: int, robots: range) -> _native.Lease:
         """Returns the native object that steps robots under the lease `number`."""
         return _native.Lease(self._native, number, robots.start, len(robots))

@@ -94,6 +94,15 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
             self._path, self._n_missed = None, 0
         return answer
 
+    def _memory(self) -> dict[str, Any]:
+        generator = self.np_random, self._np_random_seed
+        return {"generator": generator, "path": self._path}
+
+    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+        self._answer, self._path = answer, memory["path"]
+        self._np_random, self._np_random_seed = memory["generator"]
+        self._truth = self._session.truth(answer)[0] if self._reveals else None
+
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
         """Updates the observations with one empty frame per missed step, then with `answer`."""
         if self._robot is not None:

@@ -171,6 +171,17 @@ class WildfireMovesEnv(WorldEnv):
             raise not_reset()
         return self._flights.masks[0]
 
+    def _form(self) -> str:
+        return f"{type(self).__name__} with {self._observations.form}"
+
+    def _memory(self) -> dict[str, Any]:
+        return {**super()._memory(), "observations": self._observations.memory()}
+
+    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+        super()._recall(answer, memory)
+        self._begin_path(answer)
+        self._observations.recall(memory["observations"])
+
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Makes a move that does not complete its path."""
         assert self._answer is not None
@@ -268,7 +279,9 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         return as_choices(actions, self.num_envs, wire.N_MOVES)
 
-    def _step_worlds(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _step_worlds(
+        self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
         completed = flown & self._flights.completes()
         if not completed.any():
             return self._move(actions, flown)

@@ -175,7 +175,9 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         return as_choices(actions, self.num_envs, int(self._plans.action_space.n))
 
-    def _step_worlds(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _step_worlds(
+        self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
         self._exchange(self._plans.paths(actions), flown)
         self._plans.see(flown, actions, self._results, self._frames)
         return self._columns.rewards.copy()

@@ -1,6 +1,7 @@
 """Observations of learners: their parts, and the space of each part."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from itertools import zip_longest
 from typing import Any, Final, Literal, TypeAlias, cast
 
@@ -151,6 +152,36 @@ class Observations:
             self._belief.correct(frames, moved)
             self._belief.predict(moved)
         self._show(moved)
+
+    @property
+    def form(self) -> str:
+        """Names the parts, and the kind of belief if they need one."""
+        kind = f", kind={self._kind!r}" if OF_BELIEF & set(self._names) else ""
+        return f"observation={self._names}{kind}"
+
+    def memory(self) -> dict[str, Any]:
+        """Returns what the observations depend on, apart from the last frames."""
+        flights = self._flights
+        return {
+            "belief": copy(self._belief),
+            "last_seen": None if self._last_seen is None else self._last_seen.memory(),
+            "moves": [] if flights is None else [flights.made(row) for row in range(self._n_rows)],
+        }
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        """Continues from `memory`; the environment has begun the paths of all robots again."""
+        self._belief = copy(memory["belief"])
+        if self._last_seen is not None:
+            self._last_seen.recall(memory["last_seen"])
+        self._show(np.ones(self._n_rows, np.bool_))
+        # The moves of the incomplete paths are made again.
+        made: list[NDArray[np.uint8]] = memory["moves"]
+        for index in range(max(map(len, made), default=0)):
+            moved = np.array([len(moves) > index for moves in made])
+            actions = [int(moves[index]) if len(moves) > index else 0 for moves in made]
+            if self._flights is not None:
+                self._flights.move(moved, np.array(actions, np.uint8))
+                self.visit(moved)
 
     def visit(self, moved: NDArray[np.bool_]) -> None:
         """Updates the rows `moved` with a move that did not complete its path."""

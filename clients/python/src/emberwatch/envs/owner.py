@@ -7,10 +7,13 @@ from typing import Any
 from gymnasium.envs.registration import EnvSpec
 
 from emberwatch.client.lease import Lease
+from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_json
 from emberwatch.common.paths import with_absolute_paths
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
+from emberwatch.envs.state import EnvState
+from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
 
 
@@ -82,6 +85,55 @@ class SessionOwner:
         """Turns off the warning about resets on a task's test seeds."""
         self._session.allows_test_worlds = True
 
+    def clone_state(self) -> EnvState:
+        """Returns the state of worlds, robots, beliefs and observations, for `restore_state`.
+
+        The state holds the hidden states, so planning on restored worlds is an oracle. Wrappers
+        keep their own memory, such as the number of steps in Gymnasium's `TimeLimit`.
+
+        Raises:
+            InvalidArgumentError: If the worlds are on a server (then see `Client.snapshot`), or the
+                environment plans (`WildfireObjective`).
+            EmberwatchError: Code ``"closed"`` before the first reset, code ``"interrupted"`` if an
+                earlier step or reset did not finish.
+        """
+        with self._session.turn:
+            worlds = self._session.clone_state()
+            return EnvState.of(self._form(), worlds, self._memory())
+
+    def restore_state(self, state: EnvState) -> None:
+        """Returns to a state of `clone_state`, as often as you like.
+
+        The following steps and resets give the same observations, rewards and infos, to the byte.
+        The state may come from another environment, also in another process, that was made with the
+        same arguments. Reset this environment once before.
+
+        Raises:
+            InvalidArgumentError: If the state is of other worlds or another kind of environment, or
+                the worlds are on a server. Nothing has changed then.
+            EmberwatchError: Code ``"closed"`` before the first reset.
+        """
+        form = self._form()
+        if getattr(state, "form", None) != form:
+            got = state.form if isinstance(state, EnvState) else repr_of(state)  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise invalid("state", f"a state of {form}", got)
+        with self._session.turn:
+            answer = self._session.restore_state(state.worlds)
+            self._recall(answer, state.recall())
+            self._session.finish()
+
+    def _form(self) -> str:
+        """Names the class and what it observes."""
+        raise NotImplementedError
+
+    def _memory(self) -> dict[str, Any]:
+        """Returns what the future depends on, apart from the worlds."""
+        raise NotImplementedError
+
+    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+        """Continues from restored worlds, whose current step is `answer`, and from `_memory`."""
+        raise NotImplementedError
+
     def __getstate__(self) -> dict[str, Any]:
         """Refuses copies of open environments, as no two environments may act on one world."""
         return state_of(self, self.is_open, "gymnasium.make(env.spec)")
@@ -96,6 +148,6 @@ def state_of(environment: object, is_open: bool, maker: str) -> dict[str, Any]:
         raise TypeError(
             f"copy or pickle: expected a closed environment, got a {type(environment).__name__} "
             f"that is open: close it first, or make another with {maker}; "
-            "Client.snapshot and Lease.fork copy worlds"
+            "clone_state copies its state"
         )
     return vars(environment).copy()

@@ -216,6 +216,16 @@ class WildfireEnv(WorldEnv):
             session.finish()
         return observation, reward, terminated, truncated, info
 
+    def _form(self) -> str:
+        return f"{type(self).__name__} with {self._observations.form}"
+
+    def _memory(self) -> dict[str, Any]:
+        return {**super()._memory(), "observations": self._observations.memory()}
+
+    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+        super()._recall(answer, memory)
+        self._observations.recall(memory["observations"])
+
     def _seen(
         self, answer: StepAnswer, step: int, n_visited: int, cells: NDArray[np.int64]
     ) -> tuple[Any, dict[str, Any]]:
@@ -276,6 +286,8 @@ class WildfireVectorEnv(WorldVectorEnv):
         chosen = moves(actions, self.num_envs, n_moves)
         return as_moves(actions, self.num_envs, n_moves) if chosen is None else chosen
 
-    def _step_worlds(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _step_worlds(
+        self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
         self._exchange(actions, flown)
         return self._columns.rewards.copy()

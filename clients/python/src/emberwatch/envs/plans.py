@@ -11,6 +11,7 @@ import emberwatch._native as _native
 from emberwatch.client.wire import RobotResult, StepResult, WorldResult
 from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
+from emberwatch.envs.state import EnvState
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
 
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
@@ -182,6 +183,18 @@ class PlansOwner:
     """The public attributes of environments whose actions choose a plan."""
 
     _plans: Plans
+
+    def clone_state(self) -> EnvState:
+        """Refused: the plans of this environment cannot be copied."""
+        raise self._no_state("clone_state")
+
+    def restore_state(self, state: EnvState) -> None:
+        """Refused: the plans of this environment cannot be copied."""
+        raise self._no_state("restore_state")
+
+    def _no_state(self, call: str) -> InvalidArgumentError:
+        expected = "an environment of paths or moves, as plans cannot be copied"
+        return invalid(call, expected, type(self).__name__)
 
     @property
     def objectives(self) -> tuple[str, ...]:

@@ -189,6 +189,23 @@ class Session:
                 raise
         return self._begin(indices, seeds)
 
+    def clone_state(self) -> bytes:
+        """Returns the state of the worlds, which must be in this process."""
+        if self._client is None or self._state is not State.READY:
+            raise self._no_step()
+        return self._client.clone_state()
+
+    def restore_state(self, worlds: bytes) -> StepAnswer:
+        """Replaces the worlds; returns the results and frames of their current steps."""
+        if self._client is None or not self.is_open:
+            raise not_reset()
+        self.begin_reset()
+        self._open(0)
+        with self._classified():
+            self._client.restore_state(worlds)
+            self._state = State.MOVED
+            return self._observe()
+
     def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
         """Flies a path with each robot, or with each of the consecutive robots `rows`.
 

@@ -232,7 +232,9 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         raise NotImplementedError
 
-    def _step_worlds(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _step_worlds(
+        self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
         """Steps the rows `flown`, and returns rewards; the values of other rows are ignored."""
         raise NotImplementedError
 
@@ -246,6 +248,32 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _path(self, row: int) -> NDArray[np.intp] | None:
         """Returns the cells of a robot's last path, which are kept only with a render mode."""
         return self._paths[row]
+
+    def _form(self) -> str:
+        mode, steps = self.autoreset_mode.value, self._max_steps
+        form = f"{self._memorised().form}, max_episode_steps={steps}, autoreset_mode={mode}"
+        return f"{type(self).__name__} with {form}"
+
+    def _memory(self) -> dict[str, Any]:
+        return {
+            "elapsed": self._elapsed,
+            "over": self._over,
+            "generators": self._generators,
+            "paths": self._paths,
+            "observations": self._memorised().memory(),
+        }
+
+    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+        self._take(answer)
+        self._elapsed, self._over = memory["elapsed"], memory["over"]
+        self._has_ended = bool(self._over.any())
+        self._generators, self._paths = memory["generators"], memory["paths"]
+        self._begin(self._every)
+        self._memorised().recall(memory["observations"])
+
+    def _memorised(self) -> Observations:
+        assert isinstance(self._observations, Observations)  # plans refuse `clone_state`
+        return self._observations
 
     def _exchange(self, paths: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
         """Flies complete paths in the rows `moved`, with one message for each run of rows."""

@@ -5,18 +5,19 @@ observation matrix ``O`` of eq. 1. The native module checks files, and this modu
 ones. `emberwatch.belief` applies the parameters to a belief.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
 from typing import Any, Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.common.arguments import as_count
+from emberwatch.common.arguments import as_array, as_count, as_integer, as_seed
 from emberwatch.common.paths import BYTE_ORDER_MARK, utf8
-from emberwatch.errors import invalid
+from emberwatch.errors import invalid, repr_of
 from emberwatch.model.airspace import Airspace
 
 Color = tuple[int, int, int]
@@ -168,6 +169,42 @@ class Model(Description):
         """Returns the built-in model `wildfire`, from section II of the paper."""
         return cls.from_toml(_native.built_in("models")["wildfire"])
 
+    def advance(
+        self, states: NDArray[np.uint8], *, seed: int | ArrayLike, step: int
+    ) -> NDArray[np.uint8]:
+        """Draws the next states of worlds, as the simulator does (eq. 4).
+
+        The result depends only on the model and the arguments. In an environment with this seed,
+        the step from X_k to X_{k+1} has ``step=env.burn_in + k``. Call it from several threads to
+        use several cores: it releases the interpreter lock.
+
+        Args:
+            states: The states of one world, (H, W), or of n worlds, (n, H, W); type uint8, values
+                below S.
+            seed: The seed of all worlds, or one seed for each world, (n,); 0 to 2**64 - 1. Worlds
+                with the same seed use the same random numbers: if their states are equal, they stay
+                equal. Give each world its own seed to draw independent futures.
+            step: Number of steps since the beginning of the burn-in, 0 to 2**64 - 1; it selects the
+                random numbers. Use another step for each further call with the same seed.
+
+        Returns:
+            The states one step later, as a new array of the same shape.
+
+        Raises:
+            InvalidArgumentError: If an argument has another shape, type or range, or the model does
+                not fit the grid.
+            NotEnoughMemoryError: If the grid does not fit in memory.
+        """
+        given = as_array(states, "states", "an array")
+        if given.ndim not in (2, 3) or given.dtype != np.uint8:
+            got = f"{given.dtype} of shape {given.shape}"
+            raise invalid("states", "uint8 of shape (H, W) or (n, H, W)", got)
+        worlds = given[np.newaxis] if given.ndim == 2 else given
+        seeds = _seeds(seed, len(worlds))
+        step = as_count(step, "step", 0, 2**64 - 1)
+        dynamics = _dynamics(self.toml, worlds.shape[1], worlds.shape[2])
+        return dynamics.advance(worlds, seeds, step).reshape(given.shape)
+
     @staticmethod
     def _read(text: str) -> dict[str, Any]:
         values = _native.read_model(text)
@@ -179,6 +216,22 @@ class Model(Description):
     @staticmethod
     def _with_radius(text: str, radius: int) -> str:
         return _native.model_with_radius(text, radius)
+
+
+@functools.lru_cache(maxsize=8)
+def _dynamics(toml: str, height: int, width: int) -> _native.Dynamics:
+    return _native.Dynamics(toml, height, width)
+
+
+def _seeds(seed: int | ArrayLike, n_worlds: int) -> NDArray[np.uint64]:
+    """Returns a seed for each world."""
+    if as_integer(seed) is not None:
+        return np.full(n_worlds, as_seed(seed), np.uint64)
+    expected = f"an integer within 0 to 2**64 - 1, or {n_worlds} of them"
+    given = as_array(seed, "seed", expected)
+    if given.shape != (n_worlds,) or given.dtype.kind not in "iu" or (given < 0).any():
+        raise invalid("seed", expected, repr_of(seed))
+    return given.astype(np.uint64)
 
 
 def _plain(value: Any) -> Any:

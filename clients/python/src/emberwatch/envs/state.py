@@ -1,0 +1,28 @@
+"""The state of an environment in memory."""
+
+import pickle
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnvState:
+    """The state of an environment, from `clone_state`; it can be pickled.
+
+    Unpickle only states that you saved: like every pickle, a state can run code.
+    """
+
+    form: str
+    """The class of the environment, and what it observes."""
+    worlds: bytes = field(repr=False)
+    """The worlds and robots, in the format of a snapshot file. They contain the hidden states."""
+    memory: bytes = field(repr=False)
+    """The rest: beliefs, memory of frames, moves of incomplete paths, generators."""
+
+    @classmethod
+    def of(cls, form: str, worlds: bytes, memory: dict[str, Any]) -> Self:
+        return cls(form, worlds, pickle.dumps(memory))
+
+    def recall(self) -> dict[str, Any]:
+        """Returns a new copy of the memory."""
+        return pickle.loads(self.memory)
