@@ -53,6 +53,7 @@ EXAMPLES = [
         "--total-steps 400 --worlds 2 --steps 5",
         r"ppo_marginal: \d\S* \+- \S+ a step on 8 worlds\nvisited twice: \d",
     ),
+    ("mcts.py", "--seeds 1000..1002 --steps 3", r"mcts: \d\S* \+- \S+ a step on 2 worlds"),
     ("minari_dataset.py", "--episodes 2 --steps 20", r"2 episodes, 40 steps"),
     (
         "filter_benchmark.py",
