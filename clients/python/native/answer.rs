@@ -241,7 +241,9 @@ impl Answer {
         py: Python<'py>,
         bytes: Range<usize>,
     ) -> PyResult<Bound<'py, PyArray1<u8>>> {
-        let slice = PySlice::new(py, bytes.start as isize, bytes.end as isize, 1);
+        // PyO3's `PySlice::new` leaks its numbers.
+        let slice = py.get_type::<PySlice>();
+        let slice = slice.call1((bytes.start, bytes.end))?;
         Ok(self.payload.bind(py).get_item(slice)?.cast_into()?)
     }
 

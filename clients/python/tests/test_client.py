@@ -3,6 +3,7 @@
 import gc
 import os
 import subprocess
+import tracemalloc
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -52,6 +53,18 @@ def test_an_answer_is_a_copy() -> None:
     assert (first.frames == kept).all()
     first.frames[:] = 0
     assert (lease.observe().frames != 0).any()
+
+
+def test_an_answer_leaves_no_memory_behind() -> None:
+    with emberwatch.embed(height=16, width=20, moves=4, burn_in=0) as client:
+        lease = client.acquire()
+        lease.observe()
+        tracemalloc.start()
+        for _ in range(2000):
+            lease.observe()
+        kept, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert kept < 20_000
 
 
 def test_a_released_world_is_free() -> None:
