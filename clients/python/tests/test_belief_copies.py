@@ -20,10 +20,8 @@ from emberwatch.model import Model
 
 SHAPE: dict[str, Any] = {"height": 12, "width": 10}
 MODEL = Model.named("wildfire-burnout")
-SMALL = Model.named("wildfire-small")
 GOLDEN = np.load(golden_options.FILE)
 PRIOR = initial_prior(MODEL, **SHAPE)
-
 #: Each kind, with its checkpoint.
 KINDS = {
     **{name: None for name, kind in belief.kinds().items() if not kind.needs_checkpoint},
@@ -39,13 +37,12 @@ def made(kind: str, folder: Path, n_worlds: int | None = 3) -> Belief:
     if checkpoint is None:
         return belief.known(MODEL, prior=PRIOR, kind=kind, n_worlds=n_worlds)
     (file := folder / checkpoint).write_bytes(GOLDEN[f"checkpoint {checkpoint}"].tobytes())
-    return belief.load(file, **SHAPE, kind=kind, model=SMALL, n_worlds=n_worlds)
+    return belief.load(file, **SHAPE, kind=kind, model="wildfire-small", n_worlds=n_worlds)
 
 
 def fed(it: Belief, seed: int, n_steps: int = 4) -> bytes:
     """Feeds random frames, and returns everything that shows the belief."""
-    rng = np.random.default_rng(seed)
-    shown: list[NDArray[Any]] = []
+    rng, shown = np.random.default_rng(seed), list[NDArray[Any]]()
     for _ in range(n_steps):
         it.predict()
         frames = rng.choice([0, 1, 2, 255], it.shape, p=[0.1, 0.06, 0.04, 0.8]).astype(np.uint8)
@@ -68,8 +65,8 @@ def test_copies_are_independent_and_continue_to_the_bit(
             one.predict()
         now = pickle.dumps(it)
         copies = [it.copy(), copy.copy(it), copy.deepcopy(it), pickle.loads(now)]
-        it.save(tmp_path / "noon.belief")
-        copies.append(belief.load(tmp_path / "noon.belief"))
+        it.save(tmp_path / "noon")
+        copies.append(belief.load(tmp_path / "noon"))
         for one in copies:
             assert repr(one) == repr(it) and one.belief.tobytes() == it.belief.tobytes()
         fed(copies[0], 2)
@@ -77,8 +74,7 @@ def test_copies_are_independent_and_continue_to_the_bit(
         assert pickle.dumps(it) == now, "copies do not change the belief"
         expected = fed(twin, 3)
         assert fed(it, 3) == expected and fed(copies[1], 3) != expected
-        for one in copies[2:]:
-            assert fed(one, 3) == expected
+        assert all(fed(one, 3) == expected for one in copies[2:])
         copies[4].reset()
         assert (copies[4].belief == made(kind, tmp_path, n_worlds).belief).all()
 
@@ -93,8 +89,7 @@ def test_spawned_processes_continue_copies(tmp_path: Path) -> None:
 
 
 def test_the_text_shows_kind_shape_worlds_and_step() -> None:
-    one = belief.known(MODEL, prior=PRIOR)
-    one.predict()
+    (one := belief.known(MODEL, prior=PRIOR)).predict()
     assert repr(one) == f"Belief('{belief.RECOMMENDED}', shape=(12, 10), worlds=1, step=1)"
     (many := belief.known(MODEL, prior=PRIOR, kind="known", n_worlds=3)).predict([1])
     assert repr(many) == "Belief('known', shape=(3, 12, 10), worlds=3, step=0 to 1)"
@@ -105,9 +100,8 @@ def test_samples_have_the_frequencies_of_each_cell() -> None:
     prior = np.random.default_rng(3).dirichlet(np.full(3, 0.5), (6, 5)).transpose(2, 0, 1)
     prior[:, 0, 0], prior[:, 5, 4] = [0, 1, 0], [0.5, 0, 0.5]
     many = belief.known(MODEL, prior=prior, kind="known", n_worlds=n)
-    drawn = many.sample(np.random.default_rng(1))
+    drawn, p = many.sample(np.random.default_rng(1)), many.belief[:, 0].astype(float)
     assert drawn.shape == (n, 6, 5) and drawn.dtype == np.uint8
-    p = many.belief[:, 0].astype(float)
     counts = np.stack([(drawn == state).sum(axis=0) for state in range(3)])
     assert (counts[p == 0] == 0).all() and (drawn[:, 0, 0] == 1).all()
     z = (counts - n * p)[p > 0] / np.sqrt(n * (p * (1 - p))[p > 0] + 1)
@@ -132,8 +126,8 @@ def test_what_cannot_be_done_is_refused_in_a_line(tmp_path: Path) -> None:
         belief.load(file, **SHAPE)
     with refuses("^height and width: expected those of the grid, as the file is a checkpoint"):
         belief.load(tmp_path / "neural_belief")
-    with refuses("^belief: write .*none/noon.belief: No such file"):
-        neural.save(tmp_path / "none" / "noon.belief")
+    with refuses("^belief: write .*none/noon: No such file"):
+        neural.save(tmp_path / "none" / "noon")
     data = file.read_bytes()
     for damaged in (data[:-1], data + b"0", data[:60] + b"?" + data[61:], data[:25], data[:20]):
         file.write_bytes(damaged)
@@ -141,18 +135,16 @@ def test_what_cannot_be_done_is_refused_in_a_line(tmp_path: Path) -> None:
             belief.load(file)
 
 
-def test_a_signal_ends_calls_about_many_worlds() -> None:
+def test_a_signal_ends_calls_about_many_worlds(request: pytest.FixtureRequest) -> None:
     prior = initial_prior(MODEL, height=64, width=64)
     it = belief.known(MODEL, prior=prior, n_worlds=1500)
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGALRM, before))
     began = time.monotonic()
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
-        with pytest.raises(KeyboardInterrupt):
-            for _ in range(50):
-                it.predict()
-    finally:
-        signal.signal(signal.SIGALRM, before)
+    signal.setitimer(signal.ITIMER_REAL, 0.1)
+    with pytest.raises(KeyboardInterrupt):
+        for _ in range(50):
+            it.predict()
     assert time.monotonic() - began < 1  # a prediction takes seconds
     assert "step=unfinished" in repr(it)
     for call in (it.predict, it.copy, it.entropy, lambda: it.belief):
