@@ -22,7 +22,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 use std::any::Any;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
 /// An array with one number per world.
 type Numbers<'py> = Bound<'py, PyArray1<f64>>;
@@ -48,15 +48,16 @@ pub struct Estimators {
     /// Copies share it.
     origin: Arc<Origin>,
     state: Mutex<State>,
+    /// The threads of the call that uses the state.
+    threads: Mutex<Pool>,
 }
 
-/// The estimators and their threads, which only one call at a time may use.
+/// The estimators, which only one call at a time may use.
 struct State {
     worlds: Vec<Box<dyn Estimator>>,
     /// Number of predictions of each world since the first belief. `None` if a signal interrupted a call, so that it is
     /// unknown whether the call changed the world's belief.
     steps: Vec<Option<u64>>,
-    threads: Pool,
 }
 
 /// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds of estimators.
@@ -84,7 +85,7 @@ impl Estimators {
         shape_of(py, height, width)?;
         let prior = Belief::from_probabilities(prior.as_array().to_owned());
         let prior = prior.map_err(|error| no_prior(py, error))?;
-        Self::new(py, Origin::known(py, model, prior, kind)?, n_worlds)
+        Self::new(py, Origin::known(py, model, prior, kind)?.into(), n_worlds)
     }
 
     /// Loads beliefs from a checkpoint, or from a file of `save`. `kind` defaults to the kind that the checkpoint was
@@ -116,13 +117,14 @@ impl Estimators {
         let kind = kind.map(|name| kind_of(name, true)).transpose()?;
         let origin = Origin::learned(py, &name, bytes.into_owned(), shape, kind, model)?;
         origin.warn_of_other_worlds(py)?;
-        Self::new(py, origin, n_worlds)
+        Self::new(py, origin.into(), n_worlds)
     }
 
     /// Returns an independent copy.
     fn copy(&self, py: Python<'_>) -> PyResult<Self> {
-        let (steps, worlds, _) = self.saved(py)?;
-        let copy = Self::of(py, Arc::clone(&self.origin), self.n_worlds, self.is_single)?;
+        let (steps, worlds) = self.saved(py)?;
+        let n_worlds = (!self.is_single).then_some(self.n_worlds);
+        let copy = Self::new(py, Arc::clone(&self.origin), n_worlds)?;
         copy.restore(py, &steps, &worlds)?;
         Ok(copy)
     }
@@ -137,7 +139,8 @@ impl Estimators {
         let saved = Saved::from_bytes(bytes)
             .ok_or_else(|| invalid(py, "belief", "bytes of a saved belief", "damaged ones"))?;
         let (origin, header) = (Origin::saved(py, &saved)?, &saved.header);
-        let it = Self::of(py, Arc::new(origin), saved.worlds.len(), header.is_single)?;
+        let n_worlds = (!header.is_single).then_some(saved.worlds.len());
+        let it = Self::new(py, origin.into(), n_worlds)?;
         it.restore(py, &header.steps, &saved.worlds)?;
         Ok(it)
     }
@@ -161,14 +164,11 @@ impl Estimators {
             return Err(invalid(py, "sample", "a belief about states", got));
         }
         let mut state = self.state(py)?;
-        let State {
-            worlds, threads, ..
-        } = &mut *state;
+        let worlds = &mut state.worlds;
         let (height, width) = self.shape.dim();
         let mut out = Array3::zeros((worlds.len(), height, width));
         let tasks = worlds.iter_mut().zip(out.outer_iter_mut()).enumerate();
-        let is_short = self.origin.is_short(self.n_worlds);
-        self.each(py, threads, is_short, tasks, |(index, (world, mut out))| {
+        self.each(py, false, tasks, |(index, (world, mut out))| {
             let mut rng = stream(seed, Purpose::Sample, index as u64);
             out.assign(&world.belief().sample(&mut rng));
         })?;
@@ -184,13 +184,11 @@ impl Estimators {
     /// Returns the beliefs, `[S, n, H, W]`: about X_k after `correct`, about X_{k+1} after `predict`.
     fn belief<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray4<f32>>> {
         let mut state = self.state(py)?;
-        let State {
-            worlds, threads, ..
-        } = &mut *state;
+        let worlds = &mut state.worlds;
         let (height, width) = self.shape.dim();
         let mut out = Array4::zeros((self.state_names.len(), worlds.len(), height, width));
         let tasks = worlds.iter_mut().zip(out.axis_iter_mut(Axis(1)));
-        self.each(py, threads, true, tasks, |(world, mut out)| {
+        self.each(py, true, tasks, |(world, mut out)| {
             out.assign(&world.belief().view());
         })?;
         Ok(out.into_pyarray(py))
@@ -199,13 +197,11 @@ impl Estimators {
     /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         let mut state = self.state(py)?;
-        let State {
-            worlds, threads, ..
-        } = &mut *state;
+        let worlds = &mut state.worlds;
         let (height, width) = self.shape.dim();
         let mut out = Array3::zeros((worlds.len(), height, width));
         let tasks = worlds.iter_mut().zip(out.outer_iter_mut());
-        self.each(py, threads, true, tasks, |(world, mut out)| {
+        self.each(py, true, tasks, |(world, mut out)| {
             out.assign(&world.belief().entropy(EntropyKind::Sum));
         })?;
         Ok(out.into_pyarray(py))
@@ -221,16 +217,10 @@ impl Estimators {
     ) -> PyResult<()> {
         let mut state = self.locked(py)?;
         let chosen = chosen.as_slice()?;
-        let n_chosen = chosen.iter().filter(|chosen| **chosen).count();
-        let State {
-            worlds,
-            steps,
-            threads,
-        } = &mut *state;
+        let State { worlds, steps } = &mut *state;
         let tasks = worlds.iter_mut().zip(steps).zip(chosen);
         let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
-        let is_short = self.origin.is_short(n_chosen);
-        let reset = self.each(py, threads, is_short, tasks, |(world, step)| {
+        let reset = self.each(py, false, tasks, |(world, step)| {
             let mut new = self.origin.estimator()?;
             if keeps_correlations {
                 keep_correlations(&**world, &mut *new);
@@ -255,14 +245,9 @@ impl Estimators {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
         let frames = self.frames(py, frames.as_array(), chosen)?;
-        let State {
-            worlds,
-            steps,
-            threads,
-        } = &mut *state;
+        let State { worlds, steps } = &mut *state;
         let tasks = worlds.iter_mut().zip(frames).enumerate();
-        let is_short = self.origin.is_short(self.n_worlds);
-        let corrected = self.each(py, threads, is_short, tasks, |(index, (world, frame))| {
+        let corrected = self.each(py, false, tasks, |(index, (world, frame))| {
             let corrected = world.correct(&frame?);
             Some((index, corrected.err()?))
         });
@@ -288,15 +273,10 @@ impl Estimators {
     fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
-        let State {
-            worlds,
-            steps,
-            threads,
-        } = &mut *state;
+        let State { worlds, steps } = &mut *state;
         let tasks = worlds.iter_mut().zip(chosen);
         let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
-        let is_short = self.origin.is_short(self.n_worlds);
-        let predicted = self.each(py, threads, is_short, tasks, |world| world.predict());
+        let predicted = self.each(py, false, tasks, |world| world.predict());
         predicted.inspect_err(|_| forget(steps, chosen))?;
         for (step, &chosen) in steps.iter_mut().zip(chosen) {
             *step = step.map(|step| step + u64::from(chosen));
@@ -324,11 +304,9 @@ impl Estimators {
             ));
         }
         let truths: Vec<Grid<u8>> = states.outer_iter().map(|it| it.to_owned()).collect();
-        let State {
-            worlds, threads, ..
-        } = &mut *state;
+        let worlds = &mut state.worlds;
         let tasks = worlds.iter_mut().zip(&truths);
-        let figures = self.each(py, threads, true, tasks, |(world, truth)| {
+        let figures = self.each(py, true, tasks, |(world, truth)| {
             let belief = world.belief();
             let brier = brier_score(belief, truth, target, self.target_state);
             [log_loss(belief, truth), brier, accuracy(belief, truth)]
@@ -348,13 +326,10 @@ impl Estimators {
         let mut state = self.state(py)?;
         let all = vec![true; state.worlds.len()];
         let frames = self.frames(py, frames.as_array(), &all)?;
-        let State {
-            worlds, threads, ..
-        } = &mut *state;
+        let worlds = &mut state.worlds;
         let tasks = worlds.iter_mut().zip(frames.iter().flatten());
         let kind = self.origin.kind;
-        let is_short = self.origin.is_short(1);
-        let scored = self.each(py, threads, is_short, tasks, |(world, frame)| {
+        let scored = self.each(py, !kind.is_parallel, tasks, |(world, frame)| {
             let observation_model = kind.traits.observation_model?(&**world);
             let likelihood = observation_model.likelihood()?;
             let score = score(world.belief(), &likelihood, frame);
@@ -367,16 +342,8 @@ impl Estimators {
 
 impl Estimators {
     /// Builds the beliefs before the first frame. `n_worlds` is `None` for a single world without an axis for worlds.
-    fn new(py: Python<'_>, origin: Origin, n_worlds: Option<usize>) -> PyResult<Self> {
-        Self::of(
-            py,
-            Arc::new(origin),
-            n_worlds.unwrap_or(1),
-            n_worlds.is_none(),
-        )
-    }
-
-    fn of(py: Python<'_>, origin: Arc<Origin>, n_worlds: usize, is_single: bool) -> PyResult<Self> {
+    fn new(py: Python<'_>, origin: Arc<Origin>, n_worlds: Option<usize>) -> PyResult<Self> {
+        let (is_single, n_worlds) = (n_worlds.is_none(), n_worlds.unwrap_or(1));
         let kind = origin.kind;
         let conditions = origin.conditions();
         let names = kind
@@ -400,17 +367,14 @@ impl Estimators {
             n_worlds,
             is_single,
             shape: origin.shape,
-            state: Mutex::new(State {
-                worlds,
-                steps,
-                threads,
-            }),
+            state: Mutex::new(State { worlds, steps }),
+            threads: Mutex::new(threads),
             origin,
         })
     }
 
-    /// Returns the number of predictions and the state of each world, and the description of the states' format.
-    fn saved(&self, py: Python<'_>) -> PyResult<(Vec<u64>, Vec<Vec<u8>>, String)> {
+    /// Returns the number of predictions and the state of each world.
+    fn saved(&self, py: Python<'_>) -> PyResult<(Vec<u64>, Vec<Vec<u8>>)> {
         let Some(handover) = self.origin.kind.traits.handover else {
             let got = format!("'{}', which cannot", self.kind);
             return Err(invalid(
@@ -421,28 +385,17 @@ impl Estimators {
             ));
         };
         let mut state = self.state(py)?;
-        let State {
-            worlds,
-            steps,
-            threads,
-        } = &mut *state;
-        let first = handover(&*worlds[0]);
+        let State { worlds, steps } = &mut *state;
         let what = format_args!("a copy of the beliefs about {} worlds", self.n_worlds);
-        check_memory(
-            py,
-            what,
-            self.n_worlds.saturating_mul(2 * first.to_bytes().len()),
-        )?;
-        let format = first.kind();
-        let is_short = self.origin.is_short(self.n_worlds);
-        let worlds = self.each(py, threads, is_short, worlds.iter_mut(), |world| {
-            handover(&**world).to_bytes()
-        })?;
-        Ok((steps.iter().flatten().copied().collect(), worlds, format))
+        let of_world = handover(&*worlds[0]).to_bytes().len();
+        check_memory(py, what, self.n_worlds.saturating_mul(2 * of_world))?;
+        let save = |world: &mut Box<dyn Estimator>| handover(&**world).to_bytes();
+        let worlds = self.each(py, false, worlds.iter_mut(), save)?;
+        Ok((steps.iter().flatten().copied().collect(), worlds))
     }
 
     fn encoded(&self, py: Python<'_>) -> PyResult<Vec<u8>> {
-        let (steps, worlds, format) = self.saved(py)?;
+        let (steps, worlds) = self.saved(py)?;
         let (height, width) = self.shape.dim();
         let prior = self.origin.prior.as_ref().map(Belief::to_bytes);
         let saved = Saved {
@@ -451,7 +404,6 @@ impl Estimators {
                 model: self.origin.model_text.clone(),
                 dim: (self.state_names.len(), height, width),
                 is_single: self.is_single,
-                format,
                 steps,
             },
             prior: prior.as_deref().unwrap_or_default(),
@@ -468,52 +420,46 @@ impl Estimators {
         n_predictions: &[u64],
         saved: &[W],
     ) -> PyResult<()> {
-        let Some(handover) = self.origin.kind.traits.handover_mut else {
-            return Err(self.unlike(py));
-        };
         let mut state = self.state(py)?;
-        let State {
-            worlds,
-            steps,
-            threads,
-        } = &mut *state;
-        let is_short = self.origin.is_short(self.n_worlds);
+        let State { worlds, steps } = &mut *state;
+        let handover = self.origin.kind.traits.handover_mut;
         let tasks = worlds.iter_mut().zip(saved);
-        let restored = self.each(py, threads, is_short, tasks, |(world, saved)| {
-            handover(&mut **world).restore(saved.as_ref())
+        let restored = self.each(py, false, tasks, |(world, saved)| {
+            handover.is_some_and(|it| it(&mut **world).restore(saved.as_ref()))
         })?;
-        if restored.contains(&false) {
-            return Err(self.unlike(py));
+        if restored != vec![true; self.n_worlds] {
+            let expected = format!(
+                "states of a belief '{}' about {} worlds",
+                self.kind, self.n_worlds
+            );
+            return Err(invalid(
+                py,
+                "belief",
+                expected,
+                "others, or a prediction that failed",
+            ));
         }
         *steps = n_predictions.iter().copied().map(Some).collect();
         Ok(())
     }
 
-    fn unlike(&self, py: Python<'_>) -> PyErr {
-        let expected = format!("the state of a belief '{}'", self.kind);
-        invalid(
-            py,
-            "belief",
-            expected,
-            "another, or one whose prediction failed",
-        )
-    }
-
-    /// Applies `work` to each task, unless a signal handler raises an exception meanwhile.
+    /// Applies `work` to each task, unless a signal handler raises an exception meanwhile. Cheap work runs on this thread.
     ///
     /// # Errors
     /// That exception. Some tasks are then done, and others are not.
     fn each<T: Send, U: Send>(
         &self,
         py: Python<'_>,
-        threads: &mut Pool,
-        is_short: bool,
+        is_cheap: bool,
         tasks: impl Iterator<Item = T>,
         work: impl Fn(T) -> U + Sync + Send,
     ) -> PyResult<Vec<U>> {
         let tasks: Vec<T> = tasks.collect();
+        let is_short = is_cheap || self.origin.is_short(tasks.len());
         let n_numbers = tasks.len() * self.n_numbers();
-        let done = detached(py, n_numbers, || threads.each(is_short, tasks, work));
+        // No other call holds the lock, as the caller has locked the state.
+        let threads = || self.threads.lock().unwrap_or_else(PoisonError::into_inner);
+        let done = detached(py, n_numbers, || threads().each(is_short, tasks, work));
         done.ok_or_else(raised)
     }
 

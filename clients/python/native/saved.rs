@@ -15,8 +15,6 @@ pub struct Header {
     /// Number of states, height and width.
     pub dim: (usize, usize, usize),
     pub is_single: bool,
-    /// [`Handover::kind`](emberwatch_belief::estimation::estimator::Handover::kind) of the estimators.
-    pub format: String,
     /// Number of predictions of each world since the first belief.
     pub steps: Vec<u64>,
 }

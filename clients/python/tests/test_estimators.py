@@ -1,5 +1,7 @@
 """Beliefs of every kind equal the Rust agent's, for one world or many; bad input is refused."""
 
+import copy
+import pickle
 import re
 import subprocess
 import textwrap
@@ -353,12 +355,19 @@ def test_an_autoencoder_works_only_on_its_grid(tmp_path: Path) -> None:
     kept.correct(np.full((8, 8), 2, np.uint8))
     kept.predict()
     assert np.allclose(kept.belief.sum(axis=0), 1, atol=1e-4)
+    assert kept.sample(np.random.default_rng(1)).shape == (8, 8)
+    for way in (copy.copy, copy.deepcopy, pickle.dumps, lambda it: it.save(tmp_path / "noon")):
+        with refuses("belief: expected a kind that can be copied and saved, got 'autoencoder'"):
+            way(kept)
     for model in (None, MODEL):
         with refuses("checkpoint: expected .*16 x 16"):
             belief.load(checkpoint, **GRID, model=model)
 
 
-def test_the_readme_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_readme_example_runs(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     page = Path(__file__).parents[1].joinpath("README.md").read_text("utf-8")
     section = page.split("## Beliefs\n")[1].split("\n## ")[0]
     lines = [line for line in section.splitlines() if line.startswith("    ") or not line]

@@ -14,13 +14,13 @@ class EmberwatchError(Exception):
     Attributes:
         code: The cause. If the server refused a request, the name of the status (PROTOCOL.md
             section 5), such as `"busy"`; the refused request changed nothing in the world. Other
-            codes are `"closed"`, `"interrupted"` (an earlier step or reset did not finish: reset
-            or resume), `"forked"` (channels and worlds in this process do not survive `fork`),
-            `"embedded"` (the worlds in this process could not be created), `"threads"` (the
-            system cannot start more threads), `"channel"` (iceoryx2, or a system call that it
-            needs, failed), `"bad_answer"` (client and server are of different releases),
-            `"program"` (a prior or a network failed), `"pid_namespace"` (the server runs in a
-            different PID namespace), `"impossible_frame"` and `"recording"`.
+            codes are `"closed"`, `"interrupted"` (an earlier step or reset did not finish: reset or
+            resume; the same of a belief's `correct` or `predict`), `"forked"` (channels and worlds
+            in this process do not survive `fork`), `"embedded"` (the worlds in this process could
+            not be created), `"threads"` (the system cannot start more threads), `"channel"`
+            (iceoryx2, or a system call that it needs, failed), `"bad_answer"` (client and server
+            are of different releases), `"program"` (a prior or a network failed), `"pid_namespace"`
+            (the server runs in a different PID namespace), `"impossible_frame"` and `"recording"`.
         worlds: With `"impossible_frame"`, the worlds of a belief whose frames were refused.
         detail: A number that comes with a refusal. Its meaning depends on the status; 0 if there is
             no number.
