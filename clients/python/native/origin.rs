@@ -184,7 +184,7 @@ impl Origin {
         let saved = self.kind.traits.handover;
         let saved = saved.map_or(0, |it| it(&*first).to_bytes().len());
         let belief = size_of_val(first.belief().as_slice());
-        memory(TABLE_BYTES + 8 * belief + 2 * saved)?;
+        memory(TABLE_BYTES + 8 * belief + 4 * saved)?;
         let tasks = (1..n_worlds).collect();
         let others =
             py.detach(|| threads.each(self.is_short(n_worlds), tasks, |_| self.estimator()));
