@@ -60,6 +60,9 @@ struct State {
     steps: Vec<Option<u64>>,
 }
 
+/// Number of worlds that are predicted together, where a kind of belief supports it.
+const BATCH: usize = 16;
+
 /// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds of estimators.
 fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
     let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
@@ -275,8 +278,19 @@ impl Estimators {
         let chosen = chosen.as_slice()?;
         let State { worlds, steps } = &mut *state;
         let tasks = worlds.iter_mut().zip(chosen);
-        let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
-        let predicted = self.each(py, false, tasks, |world| world.predict());
+        let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(&mut **world));
+        let mut tasks: Vec<&mut dyn Estimator> = tasks.collect();
+        let predicted = match self.origin.kind.traits.predict_together {
+            None => self.each(py, false, tasks.into_iter(), |world| world.predict()),
+            Some(together) => {
+                let batches = std::iter::from_fn(|| {
+                    let rest = tasks.split_off(tasks.len().min(BATCH));
+                    let batch = std::mem::replace(&mut tasks, rest);
+                    (!batch.is_empty()).then_some(batch)
+                });
+                self.each(py, false, batches, together)
+            }
+        };
         predicted.inspect_err(|_| forget(steps, chosen))?;
         for (step, &chosen) in steps.iter_mut().zip(chosen) {
             *step = step.map(|step| step + u64::from(chosen));
