@@ -262,7 +262,9 @@ fn new_learner(
     contents: Option<&Contents>,
 ) -> Result<Box<dyn Learner>> {
     let info = client.info();
-    warn_of_other_worlds(&spec.learned, info);
+    let mut learned = spec.learned.clone();
+    learned.worlds.extend(contents.map(|it| it.worlds.clone()));
+    warn_of_other_worlds(&learned, info);
     let worlds = learners::Worlds {
         airspace: info.airspace().map_err(anyhow::Error::msg)?,
         n_observations: info.n_observations,

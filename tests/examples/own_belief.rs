@@ -41,7 +41,7 @@ const LAST_SEEN: BeliefKind = BeliefKind {
     input: Input::Frames,
     knows_model: true,
     has_options: false,
-    of_observations: false,
+    is_of_observations: false,
     is_parallel: false,
     learned_by: None,
     chart: ("last seen", [0x88, 0x22, 0x55]),

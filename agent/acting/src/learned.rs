@@ -10,11 +10,11 @@ use std::sync::Arc;
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     values: Vec<Arc<dyn Value>>,
-    /// The worlds of each checkpoint.
-    worlds: Vec<WorldNames>,
+    /// The worlds in which each checkpoint was learned.
+    pub worlds: Vec<WorldNames>,
 }
 
-/// What worlds are called, to tell whether a checkpoint is used in worlds like those in which it was learned.
+/// What worlds are called. Tells whether a checkpoint is used where it was learned.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WorldNames {
     /// Name of the model. `None` if the server hides it.
@@ -72,11 +72,6 @@ impl Learned {
         })
     }
 
-    /// Records the worlds in which a checkpoint was learned.
-    pub fn add_worlds(&mut self, worlds: WorldNames) {
-        self.worlds.push(worlds);
-    }
-
     /// Returns a warning if a checkpoint was learned in worlds of another name than these.
     pub fn warning_in(&self, worlds: &WorldNames) -> Option<String> {
         let other = self.worlds.iter().find(|own| own.differ(worlds))?;
@@ -109,7 +104,7 @@ mod tests {
             ..names(model)
         };
         let mut learned = Learned::default();
-        learned.add_worlds(names("wildfire"));
+        learned.worlds.push(names("wildfire"));
         let warned = |worlds: &WorldNames| learned.warning_in(worlds);
         for same in [names("wildfire"), hidden("wildfire"), WorldNames::default()] {
             assert_eq!(warned(&same), None, "{same}");

@@ -74,6 +74,6 @@ fn add(learned: &mut Learned, name: &str, contents: &Contents, device: &Device) 
     })?;
     let is_other = (kind.read)(contents, device, learned)?;
     ensure!(!is_other, "expected one checkpoint of {name}, got two");
-    learned.add_worlds(contents.worlds.clone());
+    learned.worlds.push(contents.worlds.clone());
     Ok(())
 }

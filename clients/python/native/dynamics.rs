@@ -1,18 +1,14 @@
 //! The simulator's own step from any states, for Python's `Model.advance`.
 
 use crate::detached::detached;
-use crate::errors::{check_memory, interrupted, raise_of_channel};
+use crate::errors::{check_memory, interrupted, raised};
 use crate::model::{model_of, shape_of};
 use crate::refusal::{invalid, refused};
-use emberwatch_messages::errors::ChannelError;
+use crate::threads::LOOK;
 use emberwatch_model as model;
-use numpy::ndarray::Array3;
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
-use std::time::{Duration, Instant};
-
-/// Interval at which a call checks for Ctrl-C.
-const LOOK: Duration = Duration::from_millis(20);
+use std::time::Instant;
 
 /// The transition of worlds for one model on one grid. Threads can share it.
 #[pyclass(frozen, module = "emberwatch._native")]
@@ -50,8 +46,7 @@ impl Dynamics {
             let expected = format!("values below {}", self.n_states);
             return Err(invalid(py, "states", expected, got));
         }
-        let (mut next, seeds) = (Array3::zeros(states.dim()), seeds.to_owned());
-        next.assign(&states);
+        let (mut next, seeds) = (states.to_owned(), seeds.to_owned());
         let mut dynamics = self.dynamics.clone();
         let finished = detached(py, next.len(), || {
             let mut looked = Instant::now();
@@ -69,7 +64,7 @@ impl Dynamics {
             true
         });
         if !finished {
-            return Err(raise_of_channel(py, ChannelError::Interrupted));
+            return Err(raised());
         }
         Ok(next.into_pyarray(py))
     }

@@ -5,7 +5,7 @@ use crate::errors::{check_memory, raised};
 use crate::model::shape_of;
 use crate::origin::{Origin, checkpoint_bytes, kind_of, no_prior, unfit};
 use crate::refusal::{failed, invalid, refused};
-use crate::saved::{Header, Saved, is_saved};
+use crate::saved::{Saved, is_saved};
 use crate::threads::Pool;
 use emberwatch_belief::brier::{accuracy, brier_score, log_loss};
 use emberwatch_belief::estimation::SpatialFilter;
@@ -60,9 +60,6 @@ struct State {
     steps: Vec<Option<u64>>,
 }
 
-/// Number of worlds that are predicted together, where a kind of belief supports it.
-const BATCH: usize = 16;
-
 /// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds of estimators.
 fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
     let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
@@ -113,7 +110,7 @@ impl Estimators {
             return Self::from_bytes(py, &bytes);
         }
         let Some((height, width)) = grid else {
-            let expected = "those of the grid, as the file is a checkpoint";
+            let expected = "the sides of the grid, as the file is a checkpoint";
             return Err(invalid(py, "height and width", expected, "None"));
         };
         let shape = shape_of(py, height, width)?;
@@ -125,10 +122,10 @@ impl Estimators {
 
     /// Returns an independent copy.
     fn copy(&self, py: Python<'_>) -> PyResult<Self> {
-        let (steps, worlds) = self.saved(py)?;
+        let worlds = self.saved(py)?;
         let n_worlds = (!self.is_single).then_some(self.n_worlds);
         let copy = Self::new(py, Arc::clone(&self.origin), n_worlds)?;
-        copy.restore(py, &steps, &worlds)?;
+        copy.restore(py, &worlds)?;
         Ok(copy)
     }
 
@@ -141,10 +138,10 @@ impl Estimators {
     fn from_bytes(py: Python<'_>, bytes: &[u8]) -> PyResult<Self> {
         let saved = Saved::from_bytes(bytes)
             .ok_or_else(|| invalid(py, "belief", "bytes of a saved belief", "damaged ones"))?;
-        let (origin, header) = (Origin::saved(py, &saved)?, &saved.header);
-        let n_worlds = (!header.is_single).then_some(saved.worlds.len());
+        let origin = Origin::saved(py, &saved)?;
+        let n_worlds = (!saved.is_single).then_some(saved.worlds.len());
         let it = Self::new(py, origin.into(), n_worlds)?;
-        it.restore(py, &header.steps, &saved.worlds)?;
+        it.restore(py, &saved.worlds)?;
         Ok(it)
     }
 
@@ -162,7 +159,7 @@ impl Estimators {
 
     /// Draws each cell's state from its own distribution, `[n, H, W]`.
     fn sample<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<Bound<'py, PyArray3<u8>>> {
-        if self.origin.kind.of_observations {
+        if self.origin.kind.is_of_observations {
             let got = format!("'{}', which predicts observations", self.kind);
             return Err(invalid(py, "sample", "a belief about states", got));
         }
@@ -278,19 +275,8 @@ impl Estimators {
         let chosen = chosen.as_slice()?;
         let State { worlds, steps } = &mut *state;
         let tasks = worlds.iter_mut().zip(chosen);
-        let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(&mut **world));
-        let mut tasks: Vec<&mut dyn Estimator> = tasks.collect();
-        let predicted = match self.origin.kind.traits.predict_together {
-            None => self.each(py, false, tasks.into_iter(), |world| world.predict()),
-            Some(together) => {
-                let batches = std::iter::from_fn(|| {
-                    let rest = tasks.split_off(tasks.len().min(BATCH));
-                    let batch = std::mem::replace(&mut tasks, rest);
-                    (!batch.is_empty()).then_some(batch)
-                });
-                self.each(py, false, batches, together)
-            }
-        };
+        let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
+        let predicted = self.each(py, false, tasks, |world| world.predict());
         predicted.inspect_err(|_| forget(steps, chosen))?;
         for (step, &chosen) in steps.iter_mut().zip(chosen) {
             *step = step.map(|step| step + u64::from(chosen));
@@ -388,15 +374,11 @@ impl Estimators {
     }
 
     /// Returns the number of predictions and the state of each world.
-    fn saved(&self, py: Python<'_>) -> PyResult<(Vec<u64>, Vec<Vec<u8>>)> {
+    fn saved(&self, py: Python<'_>) -> PyResult<Vec<(u64, Vec<u8>)>> {
         let Some(handover) = self.origin.kind.traits.handover else {
             let got = format!("'{}', which cannot", self.kind);
-            return Err(invalid(
-                py,
-                "belief",
-                "a kind that can be copied and saved",
-                got,
-            ));
+            let expected = "a kind that can be copied and saved";
+            return Err(invalid(py, "belief", expected, got));
         };
         let mut state = self.state(py)?;
         let State { worlds, steps } = &mut *state;
@@ -405,55 +387,41 @@ impl Estimators {
         check_memory(py, what, self.n_worlds.saturating_mul(2 * of_world))?;
         let save = |world: &mut Box<dyn Estimator>| handover(&**world).to_bytes();
         let worlds = self.each(py, false, worlds.iter_mut(), save)?;
-        Ok((steps.iter().flatten().copied().collect(), worlds))
+        Ok(steps.iter().flatten().copied().zip(worlds).collect())
     }
 
     fn encoded(&self, py: Python<'_>) -> PyResult<Vec<u8>> {
-        let (steps, worlds) = self.saved(py)?;
+        let worlds = self.saved(py)?;
         let (height, width) = self.shape.dim();
         let prior = self.origin.prior.as_ref().map(Belief::to_bytes);
         let saved = Saved {
-            header: Header {
-                kind: self.kind.into(),
-                model: self.origin.model_text.clone(),
-                dim: (self.state_names.len(), height, width),
-                is_single: self.is_single,
-                steps,
-            },
+            kind: self.kind,
+            model: self.origin.model_text.as_deref(),
+            dim: (self.state_names.len(), height, width),
+            is_single: self.is_single,
             prior: prior.as_deref().unwrap_or_default(),
             checkpoint: &self.origin.checkpoint,
-            worlds: worlds.iter().map(Vec::as_slice).collect(),
+            worlds: worlds.iter().map(|it| (it.0, &*it.1)).collect(),
         };
         Ok(py.detach(|| saved.to_bytes()))
     }
 
-    /// Restores the states of all worlds from those of beliefs with the same sources.
-    fn restore<W: AsRef<[u8]> + Sync>(
-        &self,
-        py: Python<'_>,
-        n_predictions: &[u64],
-        saved: &[W],
-    ) -> PyResult<()> {
+    /// Restores all worlds from numbers of predictions and states that beliefs with the same sources have saved.
+    fn restore<W: AsRef<[u8]> + Sync>(&self, py: Python<'_>, saved: &[(u64, W)]) -> PyResult<()> {
         let mut state = self.state(py)?;
         let State { worlds, steps } = &mut *state;
         let handover = self.origin.kind.traits.handover_mut;
         let tasks = worlds.iter_mut().zip(saved);
-        let restored = self.each(py, false, tasks, |(world, saved)| {
+        let restored = self.each(py, false, tasks, |(world, (_, saved))| {
             handover.is_some_and(|it| it(&mut **world).restore(saved.as_ref()))
         })?;
         if restored != vec![true; self.n_worlds] {
-            let expected = format!(
-                "states of a belief '{}' about {} worlds",
-                self.kind, self.n_worlds
-            );
-            return Err(invalid(
-                py,
-                "belief",
-                expected,
-                "others, or a prediction that failed",
-            ));
+            let (kind, n) = (self.kind, self.n_worlds);
+            let expected = format!("states of a belief '{kind}' about {n} worlds");
+            let got = "others, or a prediction that failed";
+            return Err(invalid(py, "belief", expected, got));
         }
-        *steps = n_predictions.iter().copied().map(Some).collect();
+        *steps = saved.iter().map(|it| Some(it.0)).collect();
         Ok(())
     }
 

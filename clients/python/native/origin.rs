@@ -108,26 +108,15 @@ impl Origin {
 
     /// Reads the sources of a saved belief.
     pub fn saved(py: Python<'_>, saved: &Saved<'_>) -> PyResult<Self> {
-        let (header, is_learned) = (&saved.header, !saved.checkpoint.is_empty());
-        let (_, height, width) = header.dim;
-        let shape = shape_of(py, height, width)?;
-        let kind = kind_of(PyString::new(py, &header.kind).as_any(), is_learned)?;
-        let (model, prior) = (
-            header.model.as_deref(),
-            Belief::from_bytes(saved.prior, header.dim),
-        );
+        let is_learned = !saved.checkpoint.is_empty();
+        let shape = shape_of(py, saved.dim.1, saved.dim.2)?;
+        let kind = kind_of(PyString::new(py, saved.kind).as_any(), is_learned)?;
         if is_learned {
-            let checkpoint = saved.checkpoint.to_vec();
-            return Self::learned(
-                py,
-                "of a saved belief",
-                checkpoint,
-                shape,
-                Some(kind),
-                model,
-            );
+            let (name, bytes) = ("of a saved belief", saved.checkpoint.to_vec());
+            return Self::learned(py, name, bytes, shape, Some(kind), saved.model);
         }
-        let Some((model, prior)) = model.zip(prior) else {
+        let prior = Belief::from_bytes(saved.prior, saved.dim);
+        let Some((model, prior)) = saved.model.zip(prior) else {
             let expected = "a saved belief with a model and a first belief";
             return Err(invalid(py, "belief", expected, "one without"));
         };

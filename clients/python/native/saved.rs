@@ -1,32 +1,33 @@
-//! Beliefs as bytes, for pickles and files. A header is followed by the first belief, the checkpoint, and the state of
-//! each world, each with its length. A checksum reveals damage.
+//! Beliefs as bytes, for pickles and files: a magic text, a checksum that reveals damage, and a [`Saved`] in bincode.
 
-use serde::{Deserialize, Serialize};
+use bincode::config::{Configuration, Limit};
+use bincode::{BorrowDecode, Encode};
 
 /// The first bytes of a saved belief, with the number of the format.
 const MAGIC: &[u8] = b"emberwatch belief 1\n";
 
-/// The sources of a saved belief, as JSON.
-#[derive(Serialize, Deserialize)]
-pub struct Header {
-    pub kind: String,
+/// The limit keeps damaged lengths from exhausting memory.
+const FORM: Configuration<
+    bincode::config::LittleEndian,
+    bincode::config::Varint,
+    Limit<{ 1 << 36 }>,
+> = bincode::config::standard().with_limit();
+
+/// A saved belief, and what it is built from again. Texts and bytes are borrowed.
+#[derive(Encode, BorrowDecode)]
+pub struct Saved<'a> {
+    pub kind: &'a str,
     /// Text of the model file, if the model is known.
-    pub model: Option<String>,
+    pub model: Option<&'a str>,
     /// Number of states, height and width.
     pub dim: (usize, usize, usize),
     pub is_single: bool,
-    /// Number of predictions of each world since the first belief.
-    pub steps: Vec<u64>,
-}
-
-/// A saved belief. The bytes are borrowed from a file or a pickle.
-pub struct Saved<'a> {
-    pub header: Header,
     /// The first belief, as `f32`. Empty if there is a checkpoint.
     pub prior: &'a [u8],
     /// Empty if there is none.
     pub checkpoint: &'a [u8],
-    pub worlds: Vec<&'a [u8]>,
+    /// Of each world, the number of predictions since the first belief, and the estimator's state.
+    pub worlds: Vec<(u64, &'a [u8])>,
 }
 
 /// Returns whether a file contains a saved belief.
@@ -36,19 +37,10 @@ pub fn is_saved(bytes: &[u8]) -> bool {
 
 impl<'a> Saved<'a> {
     pub fn to_bytes(&self) -> Vec<u8> {
-        let header = serde_json::to_vec(&self.header).expect("invariant: a header is JSON");
-        let parts = [&header, self.prior, self.checkpoint];
-        let parts = parts.iter().chain(&self.worlds);
-        let n_bytes: usize = parts.clone().map(|part| 8 + part.len()).sum();
-        let mut bytes = Vec::with_capacity(MAGIC.len() + 4 + n_bytes);
-        bytes.extend([MAGIC, &[0; 4]].concat());
-        for part in parts {
-            bytes.extend((part.len() as u64).to_le_bytes());
-            bytes.extend_from_slice(part);
-        }
-        let (first, content) = bytes.split_at_mut(MAGIC.len() + 4);
-        first[MAGIC.len()..].copy_from_slice(&crc32fast::hash(content).to_le_bytes());
-        bytes
+        let content = bincode::encode_to_vec(self, FORM);
+        let content = content.expect("invariant: texts and bytes can be encoded");
+        let checksum = crc32fast::hash(&content).to_le_bytes();
+        [MAGIC, &checksum, &content].concat()
     }
 
     /// Returns `None` if the bytes are damaged.
@@ -57,23 +49,8 @@ impl<'a> Saved<'a> {
         if crc32fast::hash(content) != u32::from_le_bytes(*checksum) {
             return None;
         }
-        let mut rest = content;
-        let mut next = || {
-            let (length, after) = rest.split_first_chunk()?;
-            let length = usize::try_from(u64::from_le_bytes(*length)).ok()?;
-            let (part, after) = after.split_at_checked(length)?;
-            rest = after;
-            Some(part)
-        };
-        let header: Header = serde_json::from_slice(next()?).ok()?;
-        let (prior, checkpoint) = (next()?, next()?);
-        let worlds: Option<Vec<_>> = header.steps.iter().map(|_| next()).collect();
-        let worlds = worlds.filter(|it| !it.is_empty())?;
-        rest.is_empty().then_some(Self {
-            header,
-            prior,
-            checkpoint,
-            worlds,
-        })
+        let (saved, n_read): (Self, usize) =
+            bincode::borrow_decode_from_slice(content, FORM).ok()?;
+        (n_read == content.len() && !saved.worlds.is_empty()).then_some(saved)
     }
 }

@@ -8,7 +8,7 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 /// Time between two checks for signals. Shorter calls are not interrupted.
-const LOOK: Duration = Duration::from_millis(50);
+pub const LOOK: Duration = Duration::from_millis(50);
 
 /// A thread pool that belongs to one object. A global pool would be unusable after a fork, which copies no threads.
 #[derive(Default)]

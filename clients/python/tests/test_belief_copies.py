@@ -122,7 +122,7 @@ def test_what_cannot_be_done_is_refused_in_a_line(tmp_path: Path) -> None:
     neural.save(file := tmp_path / "noon.belief")
     with refuses("^belief .*noon.belief: expected no other arguments, as a saved belief has its"):
         belief.load(file, **SHAPE)
-    with refuses("^height and width: expected those of the grid, as the file is a checkpoint"):
+    with refuses("^height and width: expected the sides of the grid, as the file is a checkpoint"):
         belief.load(tmp_path / "neural_belief")
     with refuses("^belief: write .*none/noon: No such file"):
         neural.save(tmp_path / "none" / "noon")

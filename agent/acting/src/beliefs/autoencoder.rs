@@ -21,7 +21,7 @@ pub const AUTOENCODER: BeliefKind = BeliefKind {
     input: Input::Frames,
     knows_model: false,
     has_options: false,
-    of_observations: false,
+    is_of_observations: false,
     is_parallel: true,
     learned_by: Some(LearnedBy {
         learner: "autoencoder",

@@ -21,7 +21,7 @@ pub struct BeliefKind {
     /// Whether a DQN can learn to choose options on it.
     pub has_options: bool,
     /// Whether the belief is about each cell's next observation instead of its state.
-    pub of_observations: bool,
+    pub is_of_observations: bool,
     /// Whether a single estimator divides its work among threads.
     pub is_parallel: bool,
     /// The learner of this kind. `None` if nothing is learned.

@@ -13,7 +13,7 @@ pub const KNOWN: BeliefKind = BeliefKind {
     input: Input::Frames,
     knows_model: true,
     has_options: true,
-    of_observations: false,
+    is_of_observations: false,
     is_parallel: false,
     learned_by: None,
     chart: ("known model", [0x00, 0x72, 0xb2]),

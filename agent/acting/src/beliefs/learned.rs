@@ -15,7 +15,7 @@ pub const LEARNED: BeliefKind = BeliefKind {
     input: Input::Frames,
     knows_model: false,
     has_options: true,
-    of_observations: false,
+    is_of_observations: false,
     is_parallel: false,
     learned_by: Some(LearnedBy {
         learner: "filter",

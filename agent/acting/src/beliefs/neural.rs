@@ -31,7 +31,7 @@ pub const NEURAL: BeliefKind = BeliefKind {
     input: Input::Frames,
     knows_model: false,
     has_options: true,
-    of_observations: true,
+    is_of_observations: true,
     is_parallel: true,
     learned_by: Some(LearnedBy {
         learner: "neural",
@@ -56,7 +56,7 @@ pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
     about: "neural, converted to states by the true model's observation matrix",
     knows_model: true,
     has_options: false,
-    of_observations: false,
+    is_of_observations: false,
     build: |conditions| {
         let model = conditions.learned.get::<NeuralModel>();
         let model = model.context("checkpoint: expected a learned neural belief, got none")?;

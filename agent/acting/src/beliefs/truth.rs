@@ -9,7 +9,7 @@ pub const NONE: BeliefKind = BeliefKind {
     input: Input::Nothing,
     knows_model: false,
     has_options: false,
-    of_observations: false,
+    is_of_observations: false,
     is_parallel: false,
     learned_by: None,
     chart: ("no belief", [0xa3, 0xa3, 0xa3]),

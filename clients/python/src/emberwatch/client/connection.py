@@ -109,13 +109,21 @@ class ServerConnection(Connection):
         return self._native.truths(worlds.start, len(worlds))
 
     def clone_state(self) -> bytes:
-        """Returns the state of all worlds in this process."""
+        """Returns the state of all worlds in this process, as bytes of a snapshot.
+
+        Raises:
+            InvalidArgumentError: If the worlds are on a server; see `snapshot`.
+        """
         return self._native.snapshot()
 
     def restore_state(self, worlds: bytes) -> None:
-        """Replaces all worlds in this process with those of `clone_state`.
+        """Replaces all worlds in this process with the worlds that `clone_state` returned.
 
-        Then call `Lease.observe`, from whose steps the next paths start.
+        Then call `Lease.observe`: the next paths start from the steps that it returns.
+
+        Raises:
+            InvalidArgumentError: If the bytes are damaged or of other worlds, or the worlds are on
+                a server. No world has changed then.
         """
         self._native.restore(worlds)
 

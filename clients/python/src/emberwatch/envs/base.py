@@ -32,6 +32,9 @@ ONE_ROW: Final = np.ones(1, np.bool_)
 class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """An environment of one robot, in its own world or in a world of a running server."""
 
+    #: Missing in environments that plan, which refuse `clone_state`.
+    _observations: Observations
+
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "render_modes": list(RENDER_MODES),
         "render_fps": RENDER_FPS,
@@ -94,14 +97,25 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
             self._path, self._n_missed = None, 0
         return answer
 
-    def _memory(self) -> dict[str, Any]:
-        generator = self.np_random, self._np_random_seed
-        return {"generator": generator, "path": self._path}
+    def _form(self) -> str:
+        return f"{type(self).__name__} with {self._observations.form}"
 
-    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+    def _memory(self) -> dict[str, Any]:
+        return {
+            "generator": (self.np_random, self._np_random_seed),
+            "path": self._path,
+            "observations": self._observations.memory(),
+        }
+
+    def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
         self._answer, self._path = answer, memory["path"]
         self._np_random, self._np_random_seed = memory["generator"]
         self._truth = self._session.truth(answer)[0] if self._reveals else None
+        self._begin_path(answer)
+        self._observations.restore(memory["observations"])
+
+    def _begin_path(self, answer: StepAnswer) -> None:
+        """Begins the paths of environments of moves."""
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
         """Updates the observations with one empty frame per missed step, then with `answer`."""

@@ -43,10 +43,10 @@ class LastSeen:
         self._values[seen] = frames[seen]
 
     def memory(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Returns the last values and their ages, for `recall`."""
+        """Returns the last values and their ages, for `restore`."""
         return self._values, self.ages
 
-    def recall(self, memory: tuple[NDArray[np.uint8], NDArray[np.uint8]]) -> None:
+    def restore(self, memory: tuple[NDArray[np.uint8], NDArray[np.uint8]]) -> None:
         """Continues from the values and ages of `memory`."""
         self._values, self.ages = memory
 

@@ -171,17 +171,6 @@ class WildfireMovesEnv(WorldEnv):
             raise not_reset()
         return self._flights.masks[0]
 
-    def _form(self) -> str:
-        return f"{type(self).__name__} with {self._observations.form}"
-
-    def _memory(self) -> dict[str, Any]:
-        return {**super()._memory(), "observations": self._observations.memory()}
-
-    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
-        super()._recall(answer, memory)
-        self._begin_path(answer)
-        self._observations.recall(memory["observations"])
-
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Makes a move that does not complete its path."""
         assert self._answer is not None

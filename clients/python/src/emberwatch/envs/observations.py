@@ -1,7 +1,6 @@
 """Observations of learners: their parts, and the space of each part."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from copy import copy
 from itertools import zip_longest
 from typing import Any, Final, Literal, TypeAlias, cast
 
@@ -163,16 +162,16 @@ class Observations:
         """Returns what the observations depend on, apart from the last frames."""
         flights = self._flights
         return {
-            "belief": copy(self._belief),
+            "belief": self._belief,
             "last_seen": None if self._last_seen is None else self._last_seen.memory(),
             "moves": [] if flights is None else [flights.made(row) for row in range(self._n_rows)],
         }
 
-    def recall(self, memory: dict[str, Any]) -> None:
+    def restore(self, memory: dict[str, Any]) -> None:
         """Continues from `memory`; the environment has begun the paths of all robots again."""
-        self._belief = copy(memory["belief"])
+        self._belief = memory["belief"]
         if self._last_seen is not None:
-            self._last_seen.recall(memory["last_seen"])
+            self._last_seen.restore(memory["last_seen"])
         self._show(np.ones(self._n_rows, np.bool_))
         # The moves of the incomplete paths are made again.
         made: list[NDArray[np.uint8]] = memory["moves"]

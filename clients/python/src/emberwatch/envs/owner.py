@@ -119,7 +119,7 @@ class SessionOwner:
             raise invalid("state", f"a state of {form}", got)
         with self._session.turn:
             answer = self._session.restore_state(state.worlds)
-            self._recall(answer, state.recall())
+            self._restore(answer, state.copy_of_memory())
             self._session.finish()
 
     def _form(self) -> str:
@@ -130,7 +130,7 @@ class SessionOwner:
         """Returns what the future depends on, apart from the worlds."""
         raise NotImplementedError
 
-    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+    def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
         """Continues from restored worlds, whose current step is `answer`, and from `_memory`."""
         raise NotImplementedError
 

@@ -216,16 +216,6 @@ class WildfireEnv(WorldEnv):
             session.finish()
         return observation, reward, terminated, truncated, info
 
-    def _form(self) -> str:
-        return f"{type(self).__name__} with {self._observations.form}"
-
-    def _memory(self) -> dict[str, Any]:
-        return {**super()._memory(), "observations": self._observations.memory()}
-
-    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
-        super()._recall(answer, memory)
-        self._observations.recall(memory["observations"])
-
     def _seen(
         self, answer: StepAnswer, step: int, n_visited: int, cells: NDArray[np.int64]
     ) -> tuple[Any, dict[str, Any]]:

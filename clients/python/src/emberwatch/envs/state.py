@@ -23,6 +23,6 @@ class EnvState:
     def of(cls, form: str, worlds: bytes, memory: dict[str, Any]) -> Self:
         return cls(form, worlds, pickle.dumps(memory))
 
-    def recall(self) -> dict[str, Any]:
+    def copy_of_memory(self) -> dict[str, Any]:
         """Returns a new copy of the memory."""
         return pickle.loads(self.memory)

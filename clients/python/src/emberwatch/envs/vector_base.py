@@ -263,13 +263,13 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             "observations": self._memorised().memory(),
         }
 
-    def _recall(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+    def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
         self._take(answer)
         self._elapsed, self._over = memory["elapsed"], memory["over"]
         self._has_ended = bool(self._over.any())
         self._generators, self._paths = memory["generators"], memory["paths"]
         self._begin(self._every)
-        self._memorised().recall(memory["observations"])
+        self._memorised().restore(memory["observations"])
 
     def _memorised(self) -> Observations:
         assert isinstance(self._observations, Observations)  # plans refuse `clone_state`
@@ -318,7 +318,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return generator
 
     @property
-    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+    def np_random_seed(self) -> tuple[int, ...]:
         """The seed of each row's world in its last reset with a seed, as from `SyncVectorEnv`."""
         worlds = np.arange(self.num_envs) // self._spec.n_robots
         return tuple(self._generator(world, None)[1] for world in worlds.tolist())
