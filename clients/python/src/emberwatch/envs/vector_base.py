@@ -318,7 +318,9 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return generator
 
     @property
-    def np_random_seed(self) -> tuple[int, ...]:
+    def np_random_seed(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+    ) -> tuple[int, ...]:
         """The seed of each row's world in its last reset with a seed, as from `SyncVectorEnv`."""
         worlds = np.arange(self.num_envs) // self._spec.n_robots
         return tuple(self._generator(world, None)[1] for world in worlds.tolist())
