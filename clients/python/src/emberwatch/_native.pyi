@@ -213,7 +213,7 @@ class Connection:
         """Returns the state of all worlds in this process; refused on a connection to a server."""
 
     def restore(self, bytes: bytes) -> None:
-        """Replaces all worlds in this process with the worlds of a `snapshot`; refuses other worlds."""
+        """Replaces all worlds in this process by the worlds of a `snapshot`; refuses others."""
 
     @property
     def info(self) -> str:
