@@ -6,6 +6,7 @@ use crate::model::{model_of, shape_of};
 use crate::refusal::{invalid, refused};
 use crate::threads::LOOK;
 use emberwatch_model as model;
+use numpy::ndarray::Array3;
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
 use std::time::Instant;
@@ -46,7 +47,9 @@ impl Dynamics {
             let expected = format!("values below {}", self.n_states);
             return Err(invalid(py, "states", expected, got));
         }
-        let (mut next, seeds) = (states.to_owned(), seeds.to_owned());
+        // `to_owned` would keep the strides of a broadcast array, where several worlds share their memory.
+        let (mut next, seeds) = (Array3::zeros(states.dim()), seeds.to_owned());
+        next.assign(&states);
         let mut dynamics = self.dynamics.clone();
         let finished = detached(py, next.len(), || {
             let mut looked = Instant::now();
