@@ -1,6 +1,5 @@
 //! Tests of an agent that takes over: it starts from the former agent's stored belief, or from the kept frames.
 
-use emberwatch_agent::client::left_belief::{leave_belief, left_belief};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Handover};
 use emberwatch_protocol::control::{LeftPart, Reply, Request};
@@ -90,7 +89,9 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape), false);
     let kind = filter.expect("a filter").kind();
     let kind = format!("{kind}; freshness [H, W] as f32, rewards, paths");
-    leave_belief(&mut client, 0, &at, &kind, b"not whole").expect("leave");
+    client
+        .leave_belief(0, &at, &kind, b"not whole")
+        .expect("leave");
     client.release().expect("release");
     let ended = run(&server, &format!("{policy} --steps 10")).ends(0);
     ended.check_says(FIRST_BELIEF);
@@ -141,11 +142,11 @@ fn a_left_belief_goes_whole_to_its_robot_and_step_only() {
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let mut client = server.acquire(0..1);
     send_paths(&mut client, Paths::new(0).next(6));
-    let left = |client: &mut Client, kind| left_belief(client, 0, kind).expect("asked");
+    let left = |client: &mut Client, kind| client.left_belief(0, kind).expect("asked");
     assert_eq!(left(&mut client, "kind"), None);
     let bytes: Vec<u8> = (0..35 * 76 + 32_768).map(|n| n as u8).collect();
     let at = client.observe(0..1).expect("observe")[0].world;
-    leave_belief(&mut client, 0, &at, "kind", &bytes).expect("leave");
+    client.leave_belief(0, &at, "kind", &bytes).expect("leave");
     assert_eq!(left(&mut client, "kind"), Some(bytes));
     assert_eq!(left(&mut client, "another kind"), None);
     let wire = Wire::open(&server.instance);

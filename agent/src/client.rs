@@ -2,7 +2,6 @@
 
 pub(crate) mod errors;
 pub(crate) mod info;
-pub mod left_belief;
 pub mod truth;
 pub(crate) mod view;
 pub mod worlds;

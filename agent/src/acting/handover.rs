@@ -1,7 +1,6 @@
 //! How an agent takes over from a former agent: from the belief that the former agent left with the server, or
 //! otherwise from the frames that the server keeps.
 
-use crate::client::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
 use emberwatch_acting::beliefs::Input;
 use emberwatch_acting::rollout::{ActingAgent, AgentObservation};
@@ -87,7 +86,7 @@ pub fn take_over_left(
     let Some(kind) = acting.agent.handover_kind() else {
         return Ok(false);
     };
-    let Some(left) = left_belief(client, number, &kind)? else {
+    let Some(left) = client.left_belief(number, &kind)? else {
         return Ok(false);
     };
     let is_taken = acting.agent.take_over(&left);
@@ -113,7 +112,7 @@ pub fn leave(
     let Some((kind, bytes)) = agent.handover_kind().zip(agent.handover()) else {
         return Ok(());
     };
-    match leave_belief(client, number, &present, &kind, &bytes) {
+    match client.leave_belief(number, &present, &kind, &bytes) {
         // The server keeps no beliefs, or the belief is too long for it.
         Err(ConnectionError::Refused {
             status: Status::Malformed,

@@ -1,6 +1,5 @@
 //! Connections of this program, and requests that need no lease.
 
-use crate::client::errors::is_away;
 use emberwatch_acting::learned::{Learned, WorldNames};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::STEP_TIMEOUT;
@@ -9,14 +8,16 @@ use emberwatch_protocol::control::{Reply, Request, ServerInfo};
 use emberwatch_protocol::model::Description;
 use emberwatch_protocol::task::Task;
 use emberwatch_protocol::{Connection, Model};
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+/// Name of this program in the server's log.
+const NAME: &str = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
 
 /// Time between two attempts to reach an absent server.
 pub const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
 pub fn connect(instance: &Instance) -> Result<Connection, ConnectionError> {
-    let name = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
-    Connection::open(instance, name, STEP_TIMEOUT)
+    Connection::open(instance, NAME, STEP_TIMEOUT)
 }
 
 /// Waits up to `limit` until an instance has a server, and logs the wait once. Returns false once `is_over` is true.
@@ -25,22 +26,19 @@ pub fn wait_for_server(
     limit: Duration,
     is_over: impl Fn() -> bool,
 ) -> Result<bool, ConnectionError> {
-    let (start, mut is_logged) = (Instant::now(), false);
-    while !is_over() {
-        match connect(instance) {
-            Ok(_) => return Ok(true),
-            Err(error) if is_away(&error) && start.elapsed() < limit => {
-                if !is_logged {
-                    tracing::info!("{error}; waiting up to {limit:?}");
-                }
-                is_logged = true;
-            }
-            Err(error) => return Err(error),
+    let mut is_logged = false;
+    let opened = Connection::open_within(instance, NAME, (limit, STEP_TIMEOUT), |error| {
+        if !is_logged {
+            tracing::info!("{error}; waiting up to {limit:?}");
         }
-        let left = limit.saturating_sub(start.elapsed());
-        std::thread::sleep(RETRY_INTERVAL.min(left));
+        is_logged = true;
+        !is_over()
+    });
+    match opened {
+        Ok(_) => Ok(!is_over()),
+        Err(_) if is_over() => Ok(false),
+        Err(error) => Err(error),
     }
-    Ok(false)
 }
 
 /// Returns whether a belief of this kind about the present step was left for a robot's next agent. Needs no lease.

@@ -9,9 +9,8 @@ use emberwatch_protocol::agent_belief::AgentBelief;
 use emberwatch_protocol::channels::{AGENT_BUFFER, ChannelError, FRAME_BUFFER, Instance};
 use emberwatch_protocol::connection::{Connection, ConnectionError, unexpected};
 use emberwatch_protocol::control::{Reply, Request, ServerStatus};
-use emberwatch_protocol::message::{AgentHeader, FrameHeader, Header, TruthHeader};
+use emberwatch_protocol::message::{AgentHeader, FrameHeader, Published, TruthHeader};
 use emberwatch_protocol::observer::{Observer, Sample};
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -133,26 +132,6 @@ struct Reader {
     agents: Option<Observer<AgentHeader>>,
     /// Beliefs that arrived before their frames, with the times of arrival.
     early: Vec<(AgentBelief, Instant)>,
-    frame_gaps: Gaps,
-    truth_gaps: Gaps,
-    agent_gaps: HashMap<u32, Gaps>,
-}
-
-/// Counts gaps in sequence numbers.
-#[derive(Default)]
-struct Gaps {
-    next: Option<(Option<u32>, u64)>,
-}
-
-impl Gaps {
-    /// Returns the number of samples missing right before this one. A new publisher begins a new sequence.
-    fn before(&mut self, publisher: Option<u32>, sequence: u64) -> u64 {
-        let next = self.next.replace((publisher, sequence.wrapping_add(1)));
-        match next {
-            Some((before, next)) if before == publisher => sequence.saturating_sub(next),
-            _ => 0,
-        }
-    }
 }
 
 impl Reader {
@@ -176,9 +155,6 @@ impl Reader {
             truth: truth.ok(),
             agents: agents.ok(),
             early: Vec::new(),
-            frame_gaps: Gaps::default(),
-            truth_gaps: Gaps::default(),
-            agent_gaps: HashMap::new(),
         })
     }
 
@@ -207,24 +183,20 @@ impl Reader {
         if beliefs.is_empty() && frames.is_empty() && truths.is_empty() {
             return Ok(false);
         }
-        let server = self.frames.publisher();
         let now = Instant::now();
+        let (frames_lost, truths_lost) = (self.frames.take_lost(), lost(self.truth.as_ref()));
+        let beliefs_lost = lost(self.agents.as_ref());
         stage.change(|scene| {
+            scene.lost.frames = scene.lost.frames.saturating_add(frames_lost);
+            scene.lost.truth = scene.lost.truth.saturating_add(truths_lost);
+            scene.lost.agent = scene.lost.agent.saturating_add(beliefs_lost);
             for frame in &frames {
-                let lost = self.frame_gaps.before(server, frame.header.sequence);
-                scene.lost.frames = scene.lost.frames.saturating_add(lost);
                 scene.album.add_frame(frame, now);
             }
             for truth in &truths {
-                let lost = self.truth_gaps.before(server, truth.header.sequence);
-                scene.lost.truth = scene.lost.truth.saturating_add(lost);
                 scene.album.add_truth(truth);
             }
             for belief in &beliefs {
-                let (pid, sequence) = (belief.header.pid, belief.header.sequence);
-                let gaps = self.agent_gaps.entry(pid).or_default();
-                let lost = gaps.before(Some(pid), sequence);
-                scene.lost.agent = scene.lost.agent.saturating_add(lost);
                 match AgentBelief::try_from(belief) {
                     Ok(published) => self.early.push((published, now)),
                     Err(error) => tracing::warn!("{error}"),
@@ -240,7 +212,11 @@ impl Reader {
     }
 }
 
-fn all<H: Header>(observer: &Observer<H>) -> Result<Vec<Sample<H>>, ChannelError> {
+fn lost<H: Published>(observer: Option<&Observer<H>>) -> u64 {
+    observer.map_or(0, Observer::take_lost)
+}
+
+fn all<H: Published>(observer: &Observer<H>) -> Result<Vec<Sample<H>>, ChannelError> {
     let mut samples = Vec::new();
     while samples.len() < MAX_AT_ONCE
         && let Some(sample) = observer.try_receive()?
@@ -248,17 +224,4 @@ fn all<H: Header>(observer: &Observer<H>) -> Result<Vec<Sample<H>>, ChannelError
         samples.push(sample);
     }
     Ok(samples)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn gaps_are_counted_per_publisher() {
-        let mut gaps = Gaps::default();
-        let row = [(1, 7), (1, 8), (1, 11), (1, 11), (2, 90), (2, 92), (1, 12)];
-        let missing = row.map(|(publisher, sequence)| gaps.before(Some(publisher), sequence));
-        assert_eq!(missing, [0, 0, 2, 0, 0, 1, 0]);
-    }
 }

@@ -19,27 +19,6 @@ use std::ops::Range;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-/// Maximum time to read settings and the files that they name.
-const LONGEST_READ: Duration = Duration::from_secs(20);
-
-pub enum Worlds {
-    Served(Box<Connection>),
-    Embedded(Box<Embedded>),
-}
-
-impl Worlds {
-    pub fn backend(&mut self) -> &mut dyn Backend {
-        match self {
-            Self::Served(connection) => &mut **connection,
-            Self::Embedded(worlds) => &mut **worlds,
-        }
-    }
-}
-
-/// Milliseconds without use after which a lease on worlds in this process expires, unless a setting decides it: a day,
-/// because no other client waits for their robots.
-const LEASE_MILLIS: u64 = 86_400_000;
-
 /// Settings of worlds in this process, with the files that they name, which are read only here.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct CheckedSettings {
@@ -126,7 +105,6 @@ impl CheckedSettings {
     pub fn embed(&self, py: Python<'_>, seed: Option<u64>) -> PyResult<Embedded> {
         let mut checked = self.checked.clone();
         checked.config.seed = seed.unwrap_or(checked.config.seed);
-        check_embeddable(py, &checked.config)?;
         let worlds = py.detach(|| Embedded::new(checked));
         worlds.map_err(|error| match error.downcast_ref() {
             Some(short) => no_memory(py, short),
@@ -140,19 +118,8 @@ impl CheckedSettings {
     fn read(py: Python<'_>, settings: &str) -> PyResult<Self> {
         let asked: Map<String, Value> =
             serde_json::from_str(settings).map_err(|error| refused(py, error))?;
-        let paths: Vec<String> = asked
-            .values()
-            .filter_map(Value::as_str)
-            .map(Into::into)
-            .collect();
-        let read = move || {
-            let settings = ServerConfig {
-                lease_millis: LEASE_MILLIS,
-                ..ServerConfig::default()
-            };
-            settings.with(&asked).and_then(ServerConfig::check)
-        };
-        let checked = in_time(py, &paths, read)?.map_err(|problem| refused(py, problem))?;
+        let checked = py.detach(|| settings::read(asked));
+        let checked = checked.map_err(|problem| unread(py, problem))?;
         let given = settings.into();
         Ok(Self { given, checked })
     }
@@ -188,8 +155,8 @@ pub fn model_text(py: Python<'_>, name: String) -> PyResult<String> {
     if let Some((_, text)) = Model::built_in_files().find(|(known, _)| *known == name) {
         return Ok(text.into());
     }
-    let paths = [name.clone()];
-    let model = in_time(py, &paths, move || model_named(&name))?;
+    let model = py.detach(|| settings::in_time(settings::may_block(&name), || model_named(&name)));
+    let model = model.map_err(|problem| unread(py, problem))?;
     let model = model.map_err(|problem| refused(py, problem))?;
     let no_fly = model.file().no_fly.as_ref().and_then(|map| map.grid().ok());
     let shape = match model.hazards().and_then(Hazards::shape) {
@@ -209,42 +176,10 @@ fn text_of(model: &Model) -> String {
     toml::to_string(model.file()).expect("invariant: a model was read from TOML")
 }
 
-/// Runs `read`. If one of the paths is a pipe, device or other special file, a separate thread runs it, so that the wait
-/// can time out or be interrupted.
-fn in_time<T: Send + 'static>(
-    py: Python<'_>,
-    paths: &[String],
-    read: impl FnOnce() -> T + Send + 'static,
-) -> PyResult<T> {
-    if !paths.iter().any(may_block) {
-        return Ok(py.detach(read));
+fn unread(py: Python<'_>, problem: ReadError) -> PyErr {
+    match problem {
+        ReadError::Config(problem) => refused(py, problem),
+        ReadError::Threads(short) => no_threads(py, &short),
+        ReadError::Wait(error) => raise(py, error, "settings", LONGEST_READ.as_secs_f64()),
     }
-    let (sender, receiver) = channel();
-    let reader = spawn("settings", move || drop(sender.send(read())));
-    reader.map_err(|short| no_threads(py, &short))?;
-    let read = py.detach(move || wait_for(&receiver, Instant::now(), LONGEST_READ));
-    read.map_err(|error| raise(py, error, "settings", LONGEST_READ.as_secs_f64()))
-}
-
-/// Returns whether a path names a pipe, device or other special file, which can keep its reader waiting.
-fn may_block(path: &String) -> bool {
-    let found = std::fs::metadata(path);
-    found.is_ok_and(|kind| !kind.is_file() && !kind.is_dir())
-}
-
-/// Refuses settings that apply only to a server.
-fn check_embeddable(py: Python<'_>, settings: &ServerConfig) -> PyResult<()> {
-    let values = settings.values();
-    let settings = ServerConfig::settings().into_iter();
-    for setting in settings.filter(|it| it.for_servers) {
-        let got = &values[setting.name];
-        if *got != (setting.default)() {
-            let expected = "to be left out, as worlds in this process have no server";
-            return Err(refused(
-                py,
-                SettingError::new(setting.name, expected, got.clone()),
-            ));
-        }
-    }
-    Ok(())
 }

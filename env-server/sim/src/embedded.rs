@@ -2,23 +2,26 @@
 //!
 //! Background threads reset worlds and read and write files, so that a caller can stop waiting for them early.
 
+pub mod settings;
 #[cfg(test)]
 mod tests;
 
 use crate::config::Checked;
 use crate::limits::{check_memory, n_threads, start};
 use crate::rate::Rate;
+use crate::results::world_result;
 use crate::simulator::{ClientId, Outcome, PendingFile, PendingReply, ResetJob, ServerStats};
 use crate::simulator::{Simulator, Stepped};
 use crate::snapshot::{Job, SnapshotError, decode};
 use crate::world::{Episode, Rules};
-use anyhow::{Result, ensure};
+use anyhow::Result;
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::{Reply, ServerInfo};
 use emberwatch_messages::errors::{ConnectionError, check_status};
 use emberwatch_messages::interrupt::check_interrupt;
 use emberwatch_messages::limits::threads::NoThreads;
-use emberwatch_messages::message::{Status, StepRequest, VERSION};
+use emberwatch_messages::message::{Status, StepRequest, VERSION, WorldResult};
+use emberwatch_model::grid::Grid;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::ops::Range;
 use std::sync::Arc;
@@ -110,46 +113,19 @@ impl Embedded {
         }))
     }
 
-    /// Encodes all worlds as the bytes of a snapshot.
-    ///
-    /// # Errors
-    /// If the worlds were shut down, one of them is being reset, or they are too large for a snapshot.
-    pub fn snapshot(&mut self) -> Result<Vec<u8>> {
-        let worlds = self.ready_worlds()?;
-        Ok(self.simulator.snapshot(worlds)?)
-    }
-
-    /// Replaces all worlds with the worlds of a snapshot, which continue exactly as the saved ones would have.
-    ///
-    /// # Errors
-    /// If the worlds were shut down, one of them is being reset, or the bytes are damaged or of other worlds. No world
-    /// has changed then.
-    pub fn restore(&mut self, bytes: &[u8]) -> Result<()> {
-        let worlds = self.ready_worlds()?;
-        let restored = decode(bytes)?.restore(self.simulator.spec())?;
-        if restored.len() != worlds.len() {
-            let expected = format!("{} worlds", worlds.len());
-            return Err(SnapshotError::n_worlds(expected, restored.len()).into());
-        }
-        let restored = worlds.zip(restored);
-        let jobs = restored.filter_map(|(world, it)| self.simulator.start_with(world, it));
-        let jobs = jobs.collect();
-        self.start(jobs);
-        Ok(())
-    }
-
-    /// Returns the range of all worlds.
+    /// Returns the range of all worlds. `what` names the request in errors.
     ///
     /// # Errors
     /// If the worlds were shut down, or one of them is being reset.
-    fn ready_worlds(&mut self) -> Result<Range<usize>> {
+    fn ready_worlds(&mut self, what: &'static str) -> Result<Range<usize>, ConnectionError> {
         let worlds = self.simulator.worlds();
-        let are_ready = self.episodes(worlds.clone())?.is_some();
-        ensure!(
-            are_ready,
-            "expected worlds after their burn-in, got one during it"
-        );
-        Ok(worlds)
+        match self.episodes(worlds.clone())? {
+            Some(_) => Ok(worlds),
+            None => Err(ConnectionError::NotHere {
+                what,
+                problem: "expected worlds after their burn-in, got one during it".into(),
+            }),
+        }
     }
 
     /// Prepares for a request: installs worlds whose reset finished since the last call, and ends expired leases.
@@ -295,6 +271,59 @@ impl Backend for Embedded {
         check_status("step", reply.status, reply.detail, None)?;
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
         Ok((reply, payload))
+    }
+
+    fn truths(
+        &mut self,
+        worlds: Range<u32>,
+    ) -> Result<Vec<(WorldResult, Grid<u8>)>, ConnectionError> {
+        let shows = self.info.publish_truth;
+        let range = worlds.start as usize..worlds.end as usize;
+        match self.episodes(range)?.filter(|_| shows) {
+            Some(episodes) => Ok(episodes
+                .into_iter()
+                .map(|it| (world_result(it.outcome()), it.states().to_owned()))
+                .collect()),
+            None => Err(ConnectionError::NotHere {
+                what: "truths",
+                problem: format!(
+                    "expected embedded worlds with publish_truth that are not in a reset, got worlds {worlds:?}"
+                ),
+            }),
+        }
+    }
+
+    fn clone_state(&mut self) -> Result<Vec<u8>, ConnectionError> {
+        let what = "clone_state";
+        let worlds = self.ready_worlds(what)?;
+        let bytes = self.simulator.snapshot(worlds);
+        bytes.map_err(|error| not_here(what, &error))
+    }
+
+    fn restore_state(&mut self, bytes: &[u8]) -> Result<(), ConnectionError> {
+        let what = "restore_state";
+        let worlds = self.ready_worlds(what)?;
+        let restored = decode(bytes).and_then(|it| it.restore(self.simulator.spec()));
+        let restored = restored.map_err(|error| not_here(what, &error))?;
+        if restored.len() != worlds.len() {
+            let expected = format!("{} worlds", worlds.len());
+            return Err(not_here(
+                what,
+                &SnapshotError::n_worlds(expected, restored.len()),
+            ));
+        }
+        let restored = worlds.zip(restored);
+        let jobs = restored.filter_map(|(world, it)| self.simulator.start_with(world, it));
+        let jobs = jobs.collect();
+        self.start(jobs);
+        Ok(())
+    }
+}
+
+fn not_here(what: &'static str, error: &SnapshotError) -> ConnectionError {
+    ConnectionError::NotHere {
+        what,
+        problem: error.to_string(),
     }
 }
 

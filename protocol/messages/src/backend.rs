@@ -2,7 +2,9 @@
 
 use crate::control::{Reply, Request, ServerInfo};
 use crate::errors::{ConnectionError, garbled};
-use crate::message::{StepReply, StepRequest};
+use crate::message::{StepReply, StepRequest, WorldResult};
+use emberwatch_model::grid::Grid;
+use std::ops::Range;
 use std::time::Duration;
 
 /// The answer to a step request: the header and the payload (results of worlds, results of robots, frames). The length
@@ -40,6 +42,42 @@ pub trait Backend {
         let text = serde_json::to_vec(request).expect("invariant: requests serialise");
         let answer = self.control_text(&text, timeout)?;
         serde_json::from_slice(&answer).map_err(|error| garbled("a control request", error))
+    }
+
+    /// Copies the latest results and the hidden states of consecutive worlds in this process.
+    ///
+    /// # Errors
+    /// [`ConnectionError::NotHere`] if the worlds are on a server, do not exist, are in a reset, or hide their states.
+    fn truths(
+        &mut self,
+        _worlds: Range<u32>,
+    ) -> Result<Vec<(WorldResult, Grid<u8>)>, ConnectionError> {
+        Err(on_server("truths"))
+    }
+
+    /// Encodes all worlds in this process as the bytes of a snapshot.
+    ///
+    /// # Errors
+    /// [`ConnectionError::NotHere`] if the worlds are on a server, in a reset, or too large for a snapshot.
+    fn clone_state(&mut self) -> Result<Vec<u8>, ConnectionError> {
+        Err(on_server("clone_state"))
+    }
+
+    /// Replaces all worlds in this process with the worlds that [`Self::clone_state`] returned. They continue exactly
+    /// as the saved ones would have.
+    ///
+    /// # Errors
+    /// [`ConnectionError::NotHere`] if the worlds are on a server or in a reset, or the bytes are damaged or of other
+    /// worlds. No world has changed then.
+    fn restore_state(&mut self, _bytes: &[u8]) -> Result<(), ConnectionError> {
+        Err(on_server("restore_state"))
+    }
+}
+
+fn on_server(what: &'static str) -> ConnectionError {
+    ConnectionError::NotHere {
+        what,
+        problem: "expected worlds in this process, got worlds of a server".into(),
     }
 }
 

@@ -167,6 +167,14 @@ pub enum ConnectionError {
         /// The reason in words.
         message: String,
     },
+    /// The request applies only to worlds in this process, or cannot be met by them now. Nothing has changed.
+    #[error("{what}: {problem}")]
+    NotHere {
+        /// Name of the request.
+        what: &'static str,
+        /// What was expected and what was given.
+        problem: String,
+    },
     /// The answer is invalid, because the client and the server are different releases.
     #[error("answer to {what}: {problem}")]
     Garbled {
@@ -175,6 +183,69 @@ pub enum ConnectionError {
         /// The error in the answer.
         problem: String,
     },
+}
+
+/// What a caller can do about an error. Clients in other languages have one exception or code for each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ErrorClass {
+    /// The check set with [`crate::interrupt::interrupt_when`] ended a wait.
+    Interrupted,
+    /// An argument is invalid, or the worlds cannot do this.
+    Invalid,
+    /// No server runs on the instance. Waiting may help.
+    NoServer,
+    /// The server speaks another version of the protocol.
+    OtherVersion,
+    /// The server is in another PID namespace.
+    OtherPidNamespace,
+    /// A channel could not be opened or used.
+    Channel,
+    /// There is too little memory.
+    Memory,
+    /// The server ended. Connect again.
+    ServerGone,
+    /// No answer came in time.
+    Timeout,
+    /// The server refused the request.
+    Refused,
+    /// An answer or a sample is invalid.
+    BadAnswer,
+}
+
+impl ConnectionError {
+    /// Returns the class of the error.
+    pub fn class(&self) -> ErrorClass {
+        match self {
+            Self::Channel(channel) => channel.class(),
+            Self::Memory(_) => ErrorClass::Memory,
+            Self::ServerGone { .. } => ErrorClass::ServerGone,
+            Self::Timeout { .. } => ErrorClass::Timeout,
+            Self::Refused { .. } => ErrorClass::Refused,
+            Self::NotHere { .. } => ErrorClass::Invalid,
+            Self::Garbled { .. } => ErrorClass::BadAnswer,
+        }
+    }
+
+    /// Returns whether the server is absent or its lock is held, so that waiting may help.
+    pub fn is_away(&self) -> bool {
+        matches!(
+            self.class(),
+            ErrorClass::NoServer | ErrorClass::ServerGone | ErrorClass::Timeout
+        ) || matches!(self, Self::Channel(ChannelError::Locked { .. }))
+    }
+}
+
+impl ChannelError {
+    fn class(&self) -> ErrorClass {
+        match self {
+            Self::Interrupted => ErrorClass::Interrupted,
+            Self::InstanceName(_) => ErrorClass::Invalid,
+            Self::NoServer { .. } => ErrorClass::NoServer,
+            Self::OtherVersion { .. } => ErrorClass::OtherVersion,
+            Self::OtherPidNamespace { .. } => ErrorClass::OtherPidNamespace,
+            _ => ErrorClass::Channel,
+        }
+    }
 }
 
 /// Checks that the status of an answer to `what` is `Ok`. `message` is the server's reason for a refusal, if it sent
@@ -246,4 +317,21 @@ pub fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
 /// Returns the error for a reply to another kind of request.
 pub fn unexpected(what: &'static str, reply: &impl Debug) -> ConnectionError {
     garbled(what, format!("expected the matching reply, got {reply:?}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clients_keep_waiting_while_a_lock_is_held() {
+        let locked = ChannelError::Locked {
+            path: "lock".into(),
+            limit: Duration::ZERO,
+            holder: "pid 1".into(),
+        };
+        assert!(ConnectionError::from(locked).is_away());
+        let named = ChannelError::InstanceName("a b".into());
+        assert!(!ConnectionError::from(named).is_away());
+    }
 }

@@ -1,8 +1,8 @@
 //! A lease on robots. It records the step k for which each path is sent, and finds out whether the path was flown.
 
 use crate::backend::{Backend, StepAnswer};
-use crate::control::{ServerInfo, WorldInfo};
-use crate::errors::{ConnectionError, refused};
+use crate::control::{LeaseInfo, Reply, Request, ServerInfo, WorldInfo, WorldSeed};
+use crate::errors::{ConnectionError, refused, unexpected};
 use crate::message::{FLAG_TEAM_FRAMES, Operation, Status, StepRequest, WorldResult, worlds_of};
 use crate::payload::{WORLD_BYTES, write_step_body};
 use std::ops::Range;
@@ -24,6 +24,28 @@ pub struct Lease {
     known: Vec<Known>,
     /// Number of times that paths were sent. It serves as the sequence number of a call.
     n_sent: AtomicU64,
+}
+
+/// The robots to fly, and how to acquire them.
+#[derive(Debug, Clone)]
+pub struct Claim {
+    /// The numbers of the robots, at least one.
+    pub robots: Range<u32>,
+    /// Whether to take the robots from other clients that hold them.
+    pub takeover: bool,
+    /// Time from the last use of the lease until it ends, 0.1 s to one day; `None` for the server's default.
+    pub time_to_live: Option<Duration>,
+}
+
+impl Claim {
+    /// Claims robots that no other client holds. The lease has the server's default duration.
+    pub fn new(robots: Range<u32>) -> Self {
+        Self {
+            robots,
+            takeover: false,
+            time_to_live: None,
+        }
+    }
 }
 
 /// The last known state of a world.
@@ -79,6 +101,127 @@ impl<'a> Call<'a> {
 }
 
 impl Lease {
+    /// Acquires robots without moving them. Returns when the burn-in of their worlds is done.
+    ///
+    /// # Errors
+    /// If another client holds a robot, a `Busy` refusal names its process. Otherwise the same as [`Backend::step`], as
+    /// for the other requests of a lease; a refused request changes nothing.
+    pub fn acquire(
+        backend: &mut dyn Backend,
+        claim: &Claim,
+        timeout: Duration,
+    ) -> Result<(Self, LeaseInfo), ConnectionError> {
+        let request = Request::Acquire {
+            first_robot: claim.robots.start,
+            n_robots: claim.robots.len() as u32,
+            takeover: claim.takeover,
+            ttl_millis: claim.time_to_live.map(|time| time.as_millis() as u64),
+        };
+        let given = match backend.control(&request, timeout)? {
+            Reply::Lease(given) => given,
+            other => return Err(unexpected("acquire", &other)),
+        };
+        let lease = Self::new(backend.info(), given.lease, &claim.robots);
+        lease.note_all(&given.worlds);
+        Ok((lease, given))
+    }
+
+    /// Starts new episodes with the given seeds. Returns the worlds when the burn-in is done.
+    ///
+    /// # Errors
+    /// `Busy` if another client holds a robot of these worlds, and `NoLease` if this lease holds none.
+    pub fn reset(
+        &self,
+        backend: &mut dyn Backend,
+        worlds: Vec<WorldSeed>,
+        timeout: Duration,
+    ) -> Result<Vec<WorldInfo>, ConnectionError> {
+        let lease = self.number;
+        self.replace(backend, &Request::Reset { lease, worlds }, timeout)
+    }
+
+    /// Replaces consecutive worlds with worlds of a snapshot file on the server's machine, from index `from` of the
+    /// file on. `path` must be absolute.
+    ///
+    /// # Errors
+    /// As for [`Self::reset`], and `BadFile` for a file that is missing, damaged or of other worlds.
+    pub fn restore(
+        &self,
+        backend: &mut dyn Backend,
+        worlds: &Range<u32>,
+        (path, from): (String, u32),
+        timeout: Duration,
+    ) -> Result<Vec<WorldInfo>, ConnectionError> {
+        let request = Request::Restore {
+            lease: self.number,
+            first_world: worlds.start,
+            n_worlds: worlds.len() as u32,
+            from,
+            path,
+        };
+        self.replace(backend, &request, timeout)
+    }
+
+    /// Replaces the world `to` with a copy of the world `from`. With the same paths, both have the same future.
+    ///
+    /// # Errors
+    /// As for [`Self::reset`].
+    pub fn fork(
+        &self,
+        backend: &mut dyn Backend,
+        (from, to): (u32, u32),
+        timeout: Duration,
+    ) -> Result<Vec<WorldInfo>, ConnectionError> {
+        let lease = self.number;
+        self.replace(backend, &Request::Fork { lease, from, to }, timeout)
+    }
+
+    /// Restarts the time until the lease expires, without flying.
+    ///
+    /// # Errors
+    /// `LeaseLost` if the lease no longer holds any robot.
+    pub fn renew(
+        &self,
+        backend: &mut dyn Backend,
+        timeout: Duration,
+    ) -> Result<(), ConnectionError> {
+        let lease = self.number;
+        backend
+            .control(&Request::Renew { lease }, timeout)
+            .map(drop)
+    }
+
+    /// Returns the robots to the server.
+    ///
+    /// # Errors
+    /// `LeaseLost` if the lease no longer holds any robot.
+    pub fn release(
+        &self,
+        backend: &mut dyn Backend,
+        timeout: Duration,
+    ) -> Result<(), ConnectionError> {
+        let lease = self.number;
+        backend
+            .control(&Request::Release { lease }, timeout)
+            .map(drop)
+    }
+
+    /// Sends a request that replaces worlds of the lease, and records their steps.
+    fn replace(
+        &self,
+        backend: &mut dyn Backend,
+        request: &Request,
+        timeout: Duration,
+    ) -> Result<Vec<WorldInfo>, ConnectionError> {
+        match backend.control(request, timeout)? {
+            Reply::Reset { worlds } | Reply::Restored { worlds } => {
+                self.note_all(&worlds);
+                Ok(worlds)
+            }
+            other => Err(unexpected("a request for new worlds", &other)),
+        }
+    }
+
     /// Makes the lease with this number, on robots of a server.
     pub fn new(info: &ServerInfo, number: u64, robots: &Range<u32>) -> Self {
         let worlds = worlds_of(robots.start, robots.len() as u32, info.n_robots);

@@ -17,6 +17,7 @@ pub mod instance;
 pub mod interrupt;
 mod json;
 pub mod lease;
+pub mod left_belief;
 pub mod limits;
 pub mod message;
 pub mod observation;

@@ -38,6 +38,39 @@ headers!(
     AgentHeader,
 );
 
+/// A header of samples that a server or an agent publishes.
+pub trait Published: Header {
+    /// Returns the sender's protocol version.
+    fn version(&self) -> u32;
+
+    /// Returns the number of the world.
+    fn world(&self) -> u32;
+
+    /// Returns the number of earlier samples of the same sender. A gap means lost samples.
+    fn sequence(&self) -> u64;
+}
+
+/// Implements [`Published`] for headers with these fields.
+macro_rules! published {
+    ($($header:ident),*) => {$(
+        impl Published for $header {
+            fn version(&self) -> u32 {
+                self.version
+            }
+
+            fn world(&self) -> u32 {
+                self.world
+            }
+
+            fn sequence(&self) -> u64 {
+                self.sequence
+            }
+        }
+    )*};
+}
+
+published!(FrameHeader, TruthHeader, AgentHeader);
+
 /// Header of a `step` request. The payload of `Step` is the current step k of each world (`u64`), then a path of
 /// `n_moves` bytes for each robot. The payload of `Recall` is the step of each world; `Observe` has no payload.
 ///

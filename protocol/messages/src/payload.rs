@@ -2,10 +2,13 @@
 
 use super::capacity::MAX_ROBOTS;
 use super::control::ServerInfo;
-use super::message::{FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, WorldResult};
+use super::message::{
+    FLAG_TEAM_FRAMES, FrameHeader, RobotResult, StepReply, TruthHeader, WorldResult,
+};
+use super::sample::Sample;
 use bytemuck::AnyBitPattern;
 use emberwatch_model::frame::UNOBSERVED;
-use emberwatch_model::grid::Shape;
+use emberwatch_model::grid::{Grid, Shape};
 use emberwatch_model::path::MAX_MOVES;
 
 /// Size of one [`WorldResult`] in a payload in bytes.
@@ -155,6 +158,19 @@ pub fn split_frame_payload<'a>(
             })
         })
         .collect()
+}
+
+/// Returns the hidden states in a sample on `truth`.
+///
+/// # Errors
+/// If the payload does not fit the header. The error contains the expected value.
+pub fn truth_states(sample: &Sample<TruthHeader>) -> Result<Grid<u8>, String> {
+    let header = &sample.header;
+    let shape = Shape::new(header.height as usize, header.width as usize);
+    let shape = shape.map_err(|error| error.to_string())?;
+    let (expected, got) = (shape.n_cells(), sample.payload.len());
+    let states = Grid::from_shape_vec(shape.dim(), sample.payload.clone());
+    states.map_err(|_| format!("payload bytes: expected {expected}, got {got}"))
 }
 
 /// Appends the payload of a `Step` request: the steps, then the paths. Without paths, this is the payload of a

@@ -11,13 +11,18 @@ use super::texts::TextPort;
 use super::turn::Turn;
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::{Reply, Request, ServerInfo};
-use emberwatch_messages::errors::{check_answer, garbled};
+use emberwatch_messages::errors::{ChannelError, check_answer, garbled};
+use emberwatch_messages::interrupt::check_interrupt;
 use emberwatch_messages::message::{StepReply, StepRequest, VERSION};
 use emberwatch_messages::payload::split_step_payload;
 use std::time::{Duration, Instant};
 
 pub use emberwatch_messages::errors::{ConnectionError, check_status, refused, unexpected};
 pub use emberwatch_messages::message::worlds_of;
+
+/// The first and the longest pause between two attempts to connect.
+const FIRST_PAUSE: Duration = Duration::from_millis(5);
+const LONGEST_PAUSE: Duration = Duration::from_millis(200);
 
 /// A connection to a running server.
 pub struct Connection {
@@ -66,6 +71,32 @@ impl Connection {
             info: *info,
             sequence: 0,
         })
+    }
+
+    /// Connects as [`Self::open`] does. While the server is away, tries again for up to `wait`, after pauses that grow
+    /// from 5 ms to 200 ms. `waits` is called before each pause, and ends the wait if it returns false.
+    ///
+    /// # Errors
+    /// The same as [`Self::open`], and [`ConnectionError::Channel`] if the wait was interrupted.
+    pub fn open_within(
+        instance: &Instance,
+        client: &str,
+        (wait, timeout): (Duration, Duration),
+        mut waits: impl FnMut(&ConnectionError) -> bool,
+    ) -> Result<Self, ConnectionError> {
+        let (start, mut pause) = (Instant::now(), FIRST_PAUSE);
+        loop {
+            let error = match Self::open(instance, client, timeout) {
+                Err(error) if error.is_away() => error,
+                opened => return opened,
+            };
+            let left = wait.saturating_sub(start.elapsed());
+            if left.is_zero() || !waits(&error) {
+                return Err(error);
+            }
+            sleep(pause.min(left))?;
+            pause = LONGEST_PAUSE.min(2 * pause);
+        }
     }
 
     /// Opens all ports except the port for steps, whose size depends on the server's settings.
@@ -147,6 +178,16 @@ impl Backend for Connection {
         parts.check(&self.info).map_err(|it| garbled(WHAT, it))?;
         Ok((reply, payload))
     }
+}
+
+/// Sleeps, unless an interrupt ends the sleep.
+fn sleep(pause: Duration) -> Result<(), ChannelError> {
+    let start = Instant::now();
+    while let left @ 1.. = pause.saturating_sub(start.elapsed()).as_millis() as u64 {
+        std::thread::sleep(Duration::from_millis(left.min(5)));
+        check_interrupt()?;
+    }
+    Ok(())
 }
 
 const WHAT: &str = "step";

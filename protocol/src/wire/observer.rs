@@ -8,13 +8,15 @@ use super::node::Opened;
 use super::resources::{OBSERVER_DESCRIPTORS, check_descriptors};
 use super::shared_memory::fill_ports;
 use super::turn::Turn;
+use emberwatch_messages::errors::{ConnectionError, garbled};
 use emberwatch_messages::interrupt::check_interrupt;
-use emberwatch_messages::message::{AgentHeader, FrameHeader, Header, TruthHeader};
+use emberwatch_messages::message::{AgentHeader, FrameHeader, Published, TruthHeader, VERSION};
 pub use emberwatch_messages::sample::Sample;
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::PayloadHeader;
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
+use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 /// Time that an observer sleeps between two polls while it is busy. Publishing wakes no observer, so observers cost the
@@ -32,10 +34,27 @@ const BUSY: Duration = Duration::from_secs(1);
 type Ports<H> = (Subscriber<Ipc, [u8], WireHeader<H>>, Node<Ipc>);
 
 /// A reader of one channel of an instance. It can be opened before the server starts.
-pub struct Observer<H: Header> {
+pub struct Observer<H: Published> {
     ports: Opened<Ports<H>>,
     publisher: Cell<Option<u32>>,
+    gaps: RefCell<Gaps>,
     polling: Polling,
+}
+
+/// Gaps in sequence numbers.
+#[derive(Debug, Default)]
+struct Gaps {
+    /// The number that is expected next from each process that publishes. A new process begins a new sequence.
+    next: HashMap<Option<u32>, u64>,
+    n_lost: u64,
+}
+
+impl Gaps {
+    fn pass(&mut self, publisher: Option<u32>, sequence: u64) {
+        let next = self.next.insert(publisher, sequence.saturating_add(1));
+        let lost = next.map_or(0, |next| sequence.saturating_sub(next));
+        self.n_lost = self.n_lost.saturating_add(lost);
+    }
 }
 
 /// Chooses the interval between polls.
@@ -88,7 +107,7 @@ impl Observer<AgentHeader> {
     }
 }
 
-impl<H: Header> Observer<H> {
+impl<H: Published> Observer<H> {
     fn new(
         instance: &Instance,
         service: impl FnOnce(&Services<'_>) -> Result<Publications<H>, ChannelError>,
@@ -114,6 +133,7 @@ impl<H: Header> Observer<H> {
         Ok(Self {
             ports: Opened::new(Entries::of(&node)?, (subscriber, node)),
             publisher: Cell::new(None),
+            gaps: RefCell::default(),
             polling: Polling {
                 buffer,
                 is_eager: false,
@@ -166,12 +186,47 @@ impl<H: Header> Observer<H> {
         Ok(sample.map(|sample| {
             n_found.set(n_found.get() + 1);
             let pid = sample.header().node_id().pid::<Ipc>();
-            self.publisher.set(pid.ok().map(|id| id.value() as u32));
+            let pid = pid.ok().map(|id| id.value() as u32);
+            self.publisher.set(pid);
+            let header = sample.user_header().0;
+            self.gaps.borrow_mut().pass(pid, header.sequence());
             Sample {
-                header: sample.user_header().0,
+                header,
                 payload: sample.payload().to_vec(),
             }
         }))
+    }
+
+    /// Waits for the next sample of a world, or of any world. Returns it with the number of samples lost since the last
+    /// one returned, or `None` if no sample arrived in time.
+    ///
+    /// # Errors
+    /// As for [`Self::receive`], and [`ConnectionError::Garbled`] for a sample of another protocol version.
+    pub fn next_of(
+        &self,
+        world: Option<u32>,
+        timeout: Duration,
+    ) -> Result<Option<(Sample<H>, u64)>, ConnectionError> {
+        let start = Instant::now();
+        loop {
+            let left = timeout.saturating_sub(start.elapsed());
+            let Some(sample) = self.receive(left)? else {
+                return Ok(None);
+            };
+            let version = sample.header.version();
+            if version != VERSION {
+                let problem = format!("expected version {VERSION}, got {version}");
+                return Err(garbled("sample", problem));
+            }
+            if world.is_none_or(|world| world == sample.header.world()) {
+                return Ok(Some((sample, self.take_lost())));
+            }
+        }
+    }
+
+    /// Returns the number of samples lost before the last received one, since the last call.
+    pub fn take_lost(&self) -> u64 {
+        std::mem::take(&mut self.gaps.borrow_mut().n_lost)
     }
 
     /// Returns the process id of the server or agent that published the last received sample.
@@ -205,6 +260,17 @@ fn wake_server(services: &Services<'_>) -> Result<(), ChannelError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn gaps_are_counted_per_publisher() {
+        let mut gaps = Gaps::default();
+        let row = [(1, 7), (1, 8), (1, 11), (1, 11), (2, 90), (2, 92), (1, 12)];
+        let missing = row.map(|(publisher, sequence)| {
+            gaps.pass(Some(publisher), sequence);
+            std::mem::take(&mut gaps.n_lost)
+        });
+        assert_eq!(missing, [0, 0, 2, 0, 0, 1, 0]);
+    }
 
     #[test]
     fn an_observer_polls_often_until_a_second_after_it_was_busy() {
