@@ -1,7 +1,7 @@
 //! The answer to a step: the results of worlds and robots, and the frames.
 
+use crate::records;
 use crate::refusal::invalid;
-use crate::samples::{Robot, WorldRow, of_robot, of_world};
 use emberwatch_messages::message::{
     FLAG_TEAM_FRAMES, RobotResult, StepReply, WorldResult, worlds_of,
 };
@@ -13,6 +13,7 @@ use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
 use pyo3::types::PySlice;
 use std::ops::Range;
 
@@ -39,26 +40,37 @@ type Columns<'py> = (
     bool,
 );
 
-/// The answer to a step or observe request for consecutive robots.
-#[pyclass(frozen, module = "emberwatch._native")]
-pub struct Answer {
+/// The answer to a step or an observation: results and frames of consecutive robots.
+///
+/// Attributes:
+///     first_robot: The number of the first robot; robot r of world w has number w R + r.
+///     simulation_nanos: Nanoseconds that the simulation took.
+///     frames: The frame of each robot, `(n_robots, H, W)`: observed values, 255 in unobserved
+///         cells. If team frames were requested: the frame of each world's team,
+///         `(n_worlds, H, W)`. The array is a copy that you may write to.
+///     worlds: One `WorldResult` for each world, `(n_worlds,)` of `WORLD_DTYPE`.
+///     robots: One `RobotResult` for each robot, `(n_robots,)` of `ROBOT_DTYPE`.
+///     results: One `StepResult` for each robot, `(n_robots,)` of `RESULT_DTYPE`; a new array.
+///     world_of: The index in `worlds` of each robot's world, `(n_robots,)`.
+#[pyclass(frozen, module = "emberwatch")]
+pub struct StepAnswer {
     /// Number of robots per world.
     team: u32,
     #[pyo3(get)]
     first_robot: u32,
     n_robots: u32,
-    /// Duration of the simulation, in nanoseconds.
     #[pyo3(get)]
     simulation_nanos: u64,
     /// Number of frames, height, width.
     dim: [usize; 3],
     payload: Py<PyArray1<u8>>,
+    frames: PyOnceLock<Py<PyArray3<u8>>>,
     /// The results of the first robot and its world.
     first: (WorldResult, RobotResult),
 }
 
 #[pymethods]
-impl Answer {
+impl StepAnswer {
     #[new]
     #[expect(clippy::too_many_arguments, reason = "the fields of the header")]
     fn new(
@@ -90,6 +102,7 @@ impl Answer {
                 width,
             ],
             payload: payload.clone().unbind(),
+            frames: PyOnceLock::new(),
             first: Default::default(),
         };
         let (expected, got) = (answer.n_bytes(), payload.len());
@@ -116,53 +129,78 @@ impl Answer {
         )
     }
 
-    /// The frames, one per robot or one per world's team, `[n, H, W]`: a view of the answer's own memory.
     #[getter]
     fn frames<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
-        let frames = self.slice(py, self.head()..self.n_bytes())?;
-        frames.reshape(self.dim)
+        let made = self.frames.get_or_try_init(py, || {
+            let frames = self.slice(py, self.head()..self.n_bytes())?;
+            PyResult::Ok(frames.reshape(self.dim)?.unbind())
+        })?;
+        Ok(made.bind(py).clone())
     }
 
-    /// The worlds' results as bytes.
     #[getter]
-    fn worlds<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
-        self.slice(py, 0..self.n_worlds() * WORLD_BYTES)
+    fn worlds<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        records::view(&self.slice(py, 0..self.worlds_end())?, "WORLD_DTYPE")
     }
 
-    /// The robots' results as bytes.
     #[getter]
-    fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
-        self.slice(py, self.n_worlds() * WORLD_BYTES..self.head())
+    fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        records::view(
+            &self.slice(py, self.worlds_end()..self.head())?,
+            "ROBOT_DTYPE",
+        )
     }
 
-    /// For each robot, its world's result followed by its own result, as bytes in a new array.
     #[getter]
-    fn results<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u8>>> {
+    fn results<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let payload = self.bytes(py)?;
         let (worlds, robots) = payload.as_slice()?[..self.head()].split_at(self.worlds_end());
         let mut results = Vec::with_capacity(self.n_robots as usize * RESULT_BYTES);
         for (index, robot) in robots.chunks_exact(ROBOT_BYTES).enumerate() {
-            results.extend_from_slice(&worlds[self.world_of(index) * WORLD_BYTES..][..WORLD_BYTES]);
+            results.extend_from_slice(
+                &worlds[self.world_of_robot(index) * WORLD_BYTES..][..WORLD_BYTES],
+            );
             results.extend_from_slice(robot);
         }
-        Ok(PyArray1::from_vec(py, results))
+        records::view(&PyArray1::from_vec(py, results), "RESULT_DTYPE")
     }
 
-    /// The index of each robot's world among the worlds of this answer.
     #[getter]
-    fn world_of_robots<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
-        let worlds = (0..self.n_robots as usize).map(|index| self.world_of(index) as i64);
-        PyArray1::from_iter(py, worlds)
+    fn world_of<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
+        let robots = 0..self.n_robots as usize;
+        PyArray1::from_iter(py, robots.map(|index| self.world_of_robot(index) as i64))
     }
 
-    /// Returns the fields of one robot's `WorldResult` and `RobotResult`.
-    fn result(&self, py: Python<'_>, index: usize) -> PyResult<(WorldRow, Robot)> {
+    /// Returns the `StepResult` of one robot; `index` 0 is the first robot.
+    #[pyo3(signature = (index=0))]
+    fn result<'py>(&self, py: Python<'py>, index: usize) -> PyResult<Bound<'py, PyAny>> {
         let (world, robot) = self.results_of(py, index)?;
-        Ok((of_world(&world), of_robot(&robot)))
+        records::step_result(py, &world, &robot)
     }
 
-    /// Returns the results of the first robot's step. `pays` selects the kind of reward: 0 is the robot's share, 1 the
-    /// team's reward, 2 the robot's marginal reward.
+    fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
+        let Self {
+            first_robot,
+            simulation_nanos,
+            dim,
+            ..
+        } = self;
+        let [n_frames, height, width] = dim;
+        let first = self.result(py, 0)?.repr()?;
+        let more = match self.n_robots - 1 {
+            0 => String::new(),
+            others => format!(", and {others} more"),
+        };
+        Ok(format!(
+            "StepAnswer(first_robot={first_robot}, simulation_nanos={simulation_nanos}, \
+             frames=<uint8 ({n_frames}, {height}, {width})>, results=[{first}{more}])"
+        ))
+    }
+
+    /// Returns the first robot's results as numbers, for environments.
+    ///
+    /// The tuple has reward, terminated, truncated, step, number of distinct visited cells, and
+    /// cell (a new array, `(1, 2)`). `pays` chooses the reward: 0 share, 1 team, 2 marginal.
     fn numbers<'py>(&self, py: Python<'py>, pays: u8) -> Numbers<'py> {
         let (world, robot) = self.first;
         (
@@ -176,7 +214,7 @@ impl Answer {
     }
 }
 
-impl Answer {
+impl StepAnswer {
     /// Builds an answer from a reply's header and its payload.
     pub fn of(
         py: Python<'_>,
@@ -200,13 +238,9 @@ impl Answer {
             simulation_nanos: reply.simulation_nanos,
             dim: [n_frames(place), height, width],
             payload: PyArray1::from_vec(py, payload).unbind(),
+            frames: PyOnceLock::new(),
             first,
         }
-    }
-
-    /// Returns the step of the first world.
-    pub fn step(&self) -> u64 {
-        self.first.0.step
     }
 
     fn n_worlds(&self) -> usize {
@@ -227,7 +261,7 @@ impl Answer {
     }
 
     /// Returns the index of a robot's world. `index` counts from the first robot of this answer.
-    fn world_of(&self, index: usize) -> usize {
+    fn world_of_robot(&self, index: usize) -> usize {
         let first = self.first_robot / self.team;
         ((self.first_robot + index as u32) / self.team - first) as usize
     }
@@ -254,7 +288,7 @@ impl Answer {
         }
         let payload = self.bytes(py)?;
         let payload = payload.as_slice()?;
-        let world = &payload[self.world_of(index) * WORLD_BYTES..][..WORLD_BYTES];
+        let world = &payload[self.world_of_robot(index) * WORLD_BYTES..][..WORLD_BYTES];
         let robot = &payload[self.worlds_end() + index * ROBOT_BYTES..][..ROBOT_BYTES];
         Ok((
             bytemuck::pod_read_unaligned(world),
@@ -263,7 +297,7 @@ impl Answer {
     }
 }
 
-/// Decodes the results of all robots' steps from bytes of `wire.RESULT_DTYPE`. `pays`: see `Answer.numbers`.
+/// Decodes the results of all robots' steps from bytes of `wire.RESULT_DTYPE`. `pays`: see `StepAnswer.numbers`.
 #[pyfunction]
 pub fn columns<'py>(
     py: Python<'py>,
@@ -306,7 +340,7 @@ fn n_frames((team, first_robot, n_robots, flags): (u32, u32, u32, u32)) -> usize
     }
 }
 
-/// Returns the reward of a robot's step. `pays`: see `Answer.numbers`.
+/// Returns the reward of a robot's step. `pays`: see `StepAnswer.numbers`.
 fn paid(pays: u8, world: &WorldResult, robot: &RobotResult) -> f64 {
     match pays {
         0 => robot.reward,

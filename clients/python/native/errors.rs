@@ -4,7 +4,6 @@ use emberwatch_messages::errors::ChannelError;
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::limits::memory::{self, NoMemory};
 use emberwatch_messages::limits::threads::NoThreads;
-use emberwatch_model::text::shortened;
 use emberwatch_sim::embedded::INSTANCE;
 use pyo3::call::PyCallArgs;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyUserWarning};
@@ -90,42 +89,32 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
             let text = "these worlds were ended by shutdown: make new ones";
             error(py, "ServerGoneError", (text,))
         }
-        ConnectionError::Timeout { instance, .. } if instance == INSTANCE => {
-            let text = format!("{what} did not end within {seconds:?} s");
-            error(py, "RequestTimeoutError", (text,))
-        }
-        ConnectionError::ServerGone { instance } => {
-            let text = format!("the server on instance '{instance}' is gone");
-            error(py, "ServerGoneError", (text,))
-        }
         ConnectionError::Timeout { instance, .. } => {
-            let within = format!("instance '{instance}' within {seconds:?} s");
-            let text = format!("no answer to {what} from {within}");
+            let text = if instance == INSTANCE {
+                format!("{what} did not end within {seconds:?} s")
+            } else {
+                format!("no answer to {what} from instance '{instance}' within {seconds:?} s")
+            };
             error(py, "RequestTimeoutError", (text,))
         }
+        ConnectionError::ServerGone { .. } => error(py, "ServerGoneError", (plain(&problem),)),
         ConnectionError::Refused {
             status,
             detail,
             message,
         } => error(py, "refusal", (status as u32, detail, message)),
-        other => error(py, "EmberwatchError", (other.to_string(), "bad_answer")),
+        ConnectionError::NotHere { .. } => error(py, "InvalidArgumentError", (plain(&problem),)),
+        other => bad_answer(py, &other.to_string()),
     }
 }
 
 /// Creates the exception for a channel that could not be opened or used.
 pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
-    let text = problem.to_string();
+    let text = plain(&problem);
     match problem {
         ChannelError::Interrupted => raised(),
-        ChannelError::InstanceName(name) => {
-            let expected = "1 to 64 characters from A-Z a-z 0-9 - _";
-            error(
-                py,
-                "invalid",
-                ("instance", expected, format!("'{}'", shortened(&name))),
-            )
-        }
-        ChannelError::NoServer { .. } => error(py, "NoServerError", (text.replace('"', "'"),)),
+        ChannelError::InstanceName(_) => error(py, "InvalidArgumentError", (text,)),
+        ChannelError::NoServer { .. } => error(py, "NoServerError", (text,)),
         ChannelError::OtherVersion { version } => {
             error(py, "EmberwatchError", (text, "version_mismatch", version))
         }
@@ -134,4 +123,14 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
         }
         _ => error(py, "EmberwatchError", (text, "channel")),
     }
+}
+
+/// Creates the exception for an invalid answer or sample.
+pub fn bad_answer(py: Python<'_>, problem: &str) -> PyErr {
+    error(py, "EmberwatchError", (problem, "bad_answer"))
+}
+
+/// Returns the message of an error, with names in the quotes that Python's messages use.
+fn plain(problem: &impl Display) -> String {
+    problem.to_string().replace('"', "'")
 }

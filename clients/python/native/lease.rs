@@ -1,166 +1,412 @@
-//! A lease: the right to fly consecutive robots. Remembers, for each world, the step k that the next paths start from.
+//! The class `Lease`: the right to fly consecutive robots.
 
-use crate::answer::Answer;
-use crate::backend::Worlds;
-use crate::connection::{Connection, duration};
+use crate::answer::StepAnswer;
+use crate::arguments::{Number, absolute_path, duration, paths, range_of, seeds};
+use crate::client::{Client, warn_in_log};
 use crate::errors::interruption;
-use crate::moves;
-use crate::refusal::invalid;
-use emberwatch_messages::backend::StepAnswer;
+use crate::records;
+use emberwatch_messages::backend::{Backend, StepAnswer as Answered};
+use emberwatch_messages::control::{LeaseInfo, WorldInfo};
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::lease::{self, Call};
-use emberwatch_messages::message::{Operation, worlds_of};
+use emberwatch_messages::left_belief;
+use emberwatch_messages::message::{
+    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, WorldResult, worlds_of,
+};
 use pyo3::prelude::*;
+use pyo3::types::{PyRange, PyTuple};
+use std::ops::Range;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A lease on robots of a server.
-#[pyclass(frozen, module = "emberwatch._native")]
+/// The right to fly consecutive robots. It ends with `release`, or on leaving its `with` block.
+///
+/// For each world, the lease remembers the step k that it last stepped to, reset to or observed.
+/// The next path is for step k + 1, and the server flies it in no other step.
+///
+/// Attributes:
+///     client: The `Client` that acquired it.
+///     number: The lease's number on the server.
+///     ttl: Seconds without use after which the lease expires.
+///     robots: The numbers of its robots, a range.
+///     worlds: The worlds of these robots, a range.
+///     start: The state of these worlds when the lease was granted, a tuple of `WorldInfo`.
+#[pyclass(frozen, module = "emberwatch")]
 pub struct Lease {
-    server: Py<Connection>,
+    #[pyo3(get)]
+    client: Py<Client>,
     lease: lease::Lease,
+    robots: Range<u32>,
+    #[pyo3(get)]
+    ttl: f64,
+    #[pyo3(get)]
+    start: Py<PyTuple>,
+    is_over: AtomicBool,
 }
 
 #[pymethods]
 impl Lease {
-    #[new]
-    fn new(server: Py<Connection>, number: u64, first_robot: u32, n_robots: u32) -> Self {
-        let robots = first_robot..first_robot.saturating_add(n_robots);
-        let lease = lease::Lease::new(&server.get().info, number, &robots);
-        Self { server, lease }
+    #[getter]
+    fn number(&self) -> u64 {
+        self.lease.number()
     }
 
-    /// Flies a path with each robot. Returns `None` if the paths must be converted first (see `moves::paths`).
+    #[getter]
+    fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyRange>> {
+        python_range(py, &self.robots)
+    }
+
+    #[getter]
+    fn worlds<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyRange>> {
+        python_range(py, &self.lease.worlds())
+    }
+
+    /// Flies one path with each robot, and moves the worlds from k to k + 1.
+    ///
+    /// If other clients hold robots of the same world, the step waits for their paths, too.
+    ///
+    /// Args:
+    ///     paths: Moves: 0 up, 1 down, 2 left, 3 right. Integers of shape (n_robots, T), or (T,)
+    ///         for one robot.
+    ///     robots: The numbers of consecutive robots to fly, which must be all the lease's robots
+    ///         in one or more worlds. None: all robots of the lease.
+    ///     full: Whether to observe every cell. Requires a server with coverage "client" or "full".
+    ///     team: Whether to return one frame for each world's team instead of one for each robot.
+    ///     timeout: Seconds to wait for the answer.
+    ///
+    /// Raises:
+    ///     InvalidArgumentError: If the paths do not have this shape, type and range.
+    ///     LeaseLostError: If the lease expired or a robot was taken over.
+    ///     RequestTimeoutError: If no answer arrives; `observe` shows whether the step was made.
+    ///     ServerGoneError: If the server ended.
+    ///     EmberwatchError: With code `"late"` if the world moved on without this path; `observe`
+    ///         shows to which step. With code `"episode_over"` if the episode has ended: reset that
+    ///         world.
+    #[pyo3(signature = (paths, *, robots=None, full=false, team=false, timeout=5.0))]
     fn step(
         &self,
         py: Python<'_>,
         paths: &Bound<'_, PyAny>,
-        first_robot: u32,
-        n_robots: u32,
-        flags: u32,
-        seconds: f64,
-    ) -> PyResult<Option<Answer>> {
-        let Some(moves) = self.moves(paths, first_robot, n_robots)? else {
-            return Ok(None);
-        };
-        let place = (first_robot, n_robots, flags);
-        let answer = self.ask(py, &mut self.call(Operation::Step, place, &moves, seconds));
-        self.server.get().answered(py, answer, seconds).map(Some)
+        robots: Option<&Bound<'_, PyAny>>,
+        full: bool,
+        team: bool,
+        timeout: f64,
+    ) -> PyResult<StepAnswer> {
+        let robots = self.part(robots)?;
+        let moves = self.moves(paths, &robots)?;
+        let flags = if full { FLAG_FULL_COVERAGE } else { 0 } | team_flag(team);
+        let request = self.lease.request(Operation::Step, &robots, flags);
+        let mut call = Call::new(request, &moves, duration(timeout));
+        let answer = self.send(py, &mut call);
+        self.client.get().answered(py, answer, timeout)
     }
 
-    /// Flies a path with each robot. After each timeout, checks whether the worlds have stepped, and sends the paths
-    /// again if not. Returns the latest results, and the number of steps missed before them; `None` as in `step`. With
-    /// `accepts_late`, a world that steps without these paths causes no error.
-    fn send_paths(
+    /// Flies one path with each robot as `step` does, but waits as long as teammates take.
+    ///
+    /// After each timeout it observes whether the worlds have moved, and sends the paths again if
+    /// not. It keeps waiting as long as the server answers. A world that another thread's paths
+    /// moved counts as having moved on without these paths.
+    ///
+    /// Args:
+    ///     paths: As in `step`.
+    ///     robots: As in `step`.
+    ///     accepts_late: Whether to return the current results of a world that moved on without
+    ///         these paths, instead of raising the error with code `"late"`.
+    ///     timeout: Seconds to wait before each check whether the worlds have moved. The server's
+    ///         own deadline for teammates is added.
+    ///
+    /// Returns:
+    ///     The results and frames, and the number of earlier world steps that went unobserved.
+    ///
+    /// Raises:
+    ///     RequestTimeoutError: If the server does not answer such a check either.
+    ///     EmberwatchError: As in `step`.
+    #[pyo3(signature = (paths, *, robots=None, accepts_late=false, timeout=5.0))]
+    fn fly(
         &self,
         py: Python<'_>,
         paths: &Bound<'_, PyAny>,
-        first_robot: u32,
-        n_robots: u32,
+        robots: Option<&Bound<'_, PyAny>>,
         accepts_late: bool,
-        seconds: f64,
-    ) -> PyResult<Option<(Answer, u64)>> {
-        let Some(moves) = self.moves(paths, first_robot, n_robots)? else {
-            return Ok(None);
-        };
-        let paths = self.call(Operation::Step, (first_robot, n_robots, 0), &moves, seconds);
-        let send = |call: &mut Call<'_>| self.ask(py, call);
+        timeout: f64,
+    ) -> PyResult<(StepAnswer, u64)> {
+        let robots = self.part(robots)?;
+        let moves = self.moves(paths, &robots)?;
+        let request = self.lease.request(Operation::Step, &robots, 0);
+        let call = Call::new(request, &moves, duration(timeout));
+        let send = |call: &mut Call<'_>| self.send(py, call);
         let waits = || {
-            let warned = self.warn_of_wait(py, first_robot);
+            let warned = self.warn_of_wait(py, robots.start);
             warned.map(|()| false).map_err(interruption)
         };
-        let flown = self.lease.send_paths(paths, accepts_late, send, waits);
+        let flown = self.lease.send_paths(call, accepts_late, send, waits);
         let flown = flown.map(|flown| flown.expect("invariant: it is never given up"));
         let n_skipped = flown.as_ref().map_or(0, |flown| flown.1);
         let answer = flown.map(|flown| flown.0);
-        let answer = self.server.get().answered(py, answer, seconds)?;
-        Ok(Some((answer, n_skipped)))
+        let answer = self.client.get().answered(py, answer, timeout)?;
+        Ok((answer, n_skipped))
     }
 
-    /// Requests the latest results and frames again. The next paths start from the returned steps.
+    /// Returns the results and frames of the last step again.
+    ///
+    /// The next `step` continues from the observed step.
+    ///
+    /// Args:
+    ///     robots: The numbers of consecutive robots; None: all robots of the lease.
+    ///     team: Whether to return one frame for each world's team instead of one for each robot.
+    ///     timeout: Seconds to wait for the answer.
+    #[pyo3(signature = (*, robots=None, team=false, timeout=5.0))]
     fn observe(
         &self,
         py: Python<'_>,
-        first_robot: u32,
-        n_robots: u32,
-        flags: u32,
-        seconds: f64,
-    ) -> PyResult<Answer> {
-        let place = (first_robot, n_robots, flags);
-        let answer = self.ask(py, &mut self.call(Operation::Observe, place, &[], seconds));
-        self.server.get().answered(py, answer, seconds)
+        robots: Option<&Bound<'_, PyAny>>,
+        team: bool,
+        timeout: f64,
+    ) -> PyResult<StepAnswer> {
+        let robots = self.part(robots)?;
+        let flags = team_flag(team);
+        let request = self.lease.request(Operation::Observe, &robots, flags);
+        let answer = self.send(py, &mut Call::new(request, &[], duration(timeout)));
+        self.client.get().answered(py, answer, timeout)
     }
 
-    /// Records that a world of the lease is at this step.
-    fn note(&self, world: u32, step: u64) {
-        self.lease.note(world, step);
+    /// Begins new episodes: burn-in, then k = 0, robots at their start cells, empty frames.
+    ///
+    /// No other client may hold robots of these worlds.
+    ///
+    /// Args:
+    ///     seeds: One seed for each world; None: the server derives each seed from the world's last
+    ///         seed.
+    ///     worlds: The worlds to reset; None: all worlds of the lease.
+    ///     timeout: Seconds to wait for the answer.
+    ///
+    /// Returns:
+    ///     The state of each reset world, in the given order: a tuple of `WorldInfo`.
+    #[pyo3(signature = (seeds=None, *, worlds=None, timeout=600.0))]
+    fn reset<'py>(
+        &self,
+        py: Python<'py>,
+        seeds: Option<&Bound<'py, PyAny>>,
+        worlds: Option<&Bound<'py, PyAny>>,
+        timeout: f64,
+    ) -> PyResult<Bound<'py, PyTuple>> {
+        let all = self.worlds(py)?.into_any();
+        let seeds = self::seeds(py, seeds, worlds.unwrap_or(&all))?;
+        let limit = duration(timeout);
+        self.replace(py, "'reset'", timeout, |backend| {
+            self.lease.reset(backend, seeds, limit)
+        })
     }
 
-    /// The step of each world.
-    #[getter]
-    fn steps(&self) -> Vec<u64> {
-        self.lease.steps()
+    /// Replaces worlds of the lease with worlds from a snapshot file.
+    ///
+    /// The restored worlds continue exactly as the saved ones would have.
+    ///
+    /// Args:
+    ///     path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
+    ///     worlds: The consecutive worlds to replace; None: all worlds of the lease.
+    ///     first: The number of the first world in the file to use; the next worlds follow.
+    ///     timeout: Seconds to wait for the answer.
+    ///
+    /// Returns:
+    ///     The state of each restored world, a tuple of `WorldInfo`.
+    #[pyo3(signature = (path, *, worlds=None, first=Number(0), timeout=600.0))]
+    #[pyo3(text_signature = "($self, path, *, worlds=None, first=0, timeout=600.0)")]
+    fn restore<'py>(
+        &self,
+        py: Python<'py>,
+        path: &Bound<'py, PyAny>,
+        worlds: Option<&Bound<'py, PyAny>>,
+        first: Number,
+        timeout: f64,
+    ) -> PyResult<Bound<'py, PyTuple>> {
+        let all = self.lease.worlds();
+        let worlds = match worlds {
+            Some(worlds) => range_of("worlds", worlds, &all)?,
+            None => all,
+        };
+        let file = (absolute_path(path)?, first.0);
+        let limit = duration(timeout);
+        self.replace(py, "'restore'", timeout, |backend| {
+            self.lease.restore(backend, &worlds, file, limit)
+        })
+    }
+
+    /// Replaces the lease's world `target` with a copy of the world `source`.
+    ///
+    /// With the same actions, both worlds have the same future.
+    ///
+    /// Returns:
+    ///     The state of the world `target`, a tuple of one `WorldInfo`.
+    #[pyo3(signature = (source, target, *, timeout=5.0))]
+    fn fork<'py>(
+        &self,
+        py: Python<'py>,
+        source: Number,
+        target: Number,
+        timeout: f64,
+    ) -> PyResult<Bound<'py, PyTuple>> {
+        let limit = duration(timeout);
+        self.replace(py, "'fork'", timeout, |backend| {
+            self.lease.fork(backend, (source.0, target.0), limit)
+        })
+    }
+
+    /// Stores a belief about the current step for a robot's next client; see `Client.belief`.
+    ///
+    /// Args:
+    ///     result: The robot's last result. The server refuses a result of an earlier step.
+    ///     kind: The format of the bytes, for other agents. At most 256 bytes.
+    ///     data: At most 32,768 bytes plus 76 per cell; more if the model has over 18 states.
+    ///     robot: The robot's number; None: the first robot of the lease.
+    ///     timeout: Seconds to wait for the answer.
+    #[pyo3(signature = (result, kind, data, *, robot=None, timeout=5.0))]
+    fn leave_belief(
+        &self,
+        py: Python<'_>,
+        result: &Bound<'_, PyAny>,
+        kind: &str,
+        data: &[u8],
+        robot: Option<Number>,
+        timeout: f64,
+    ) -> PyResult<()> {
+        let world = result.getattr("world")?;
+        let at = WorldResult {
+            episode: world.getattr("episode")?.extract()?,
+            step: world.getattr("step")?.extract()?,
+            ..WorldResult::default()
+        };
+        let robot = robot.map_or(self.robots.start, |it| it.0);
+        let (place, limit) = ((self.lease.number(), robot), duration(timeout));
+        let leave =
+            |backend: &mut dyn Backend| left_belief::leave(backend, place, &at, kind, data, limit);
+        self.client.get().ask(py, "'leave_belief'", timeout, leave)
+    }
+
+    /// Restarts the lease's expiry time without acting.
+    #[pyo3(signature = (*, timeout=600.0))]
+    fn renew(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
+        let limit = duration(timeout);
+        let renew = |backend: &mut dyn Backend| self.lease.renew(backend, limit);
+        self.client.get().ask(py, "'renew'", timeout, renew)
+    }
+
+    /// Ends the lease, so that other clients may fly its robots. May be called again.
+    #[pyo3(signature = (*, timeout=5.0))]
+    fn release(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
+        if self.is_over.swap(true, Ordering::Relaxed) {
+            return Ok(());
+        }
+        let limit = duration(timeout);
+        let release = |backend: &mut dyn Backend| self.lease.release(backend, limit);
+        self.client.get().ask(py, "'release'", timeout, release)
+    }
+
+    fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    /// Releases the robots. If an error ends the block, that error is kept, because it says more.
+    #[pyo3(signature = (kind, *_error))]
+    fn __exit__(
+        &self,
+        py: Python<'_>,
+        kind: &Bound<'_, PyAny>,
+        _error: &Bound<'_, PyTuple>,
+    ) -> PyResult<()> {
+        match self.release(py, 5.0) {
+            Err(_) if !kind.is_none() => Ok(()),
+            released => released,
+        }
+    }
+
+    fn __repr__(&self) -> String {
+        let Range { start, end } = self.robots;
+        format!("<Lease {} of robots {start} to {}>", self.number(), end - 1)
     }
 }
 
 impl Lease {
-    fn call<'a>(
-        &self,
-        operation: Operation,
-        (first_robot, n_robots, flags): (u32, u32, u32),
-        moves: &'a [u8],
-        seconds: f64,
-    ) -> Call<'a> {
-        let robots = first_robot..first_robot.saturating_add(n_robots);
-        let request = self.lease.request(operation, &robots, flags);
-        Call::new(request, moves, duration(seconds))
+    pub fn of(
+        client: &Bound<'_, Client>,
+        lease: lease::Lease,
+        given: &LeaseInfo,
+        robots: Range<u32>,
+    ) -> PyResult<Self> {
+        Ok(Self {
+            client: client.clone().unbind(),
+            lease,
+            robots,
+            ttl: given.ttl_millis as f64 / 1000.0,
+            start: records::worlds(client.py(), &given.worlds)?.unbind(),
+            is_over: AtomicBool::new(false),
+        })
     }
 
-    /// Checks that the lease includes these robots. Returns their paths as bytes, or `None` if `moves::paths` does.
-    fn moves(
-        &self,
-        paths: &Bound<'_, PyAny>,
-        first_robot: u32,
-        n_robots: u32,
-    ) -> PyResult<Option<Vec<u8>>> {
-        let (info, own) = (&self.server.get().info, self.lease.worlds());
-        let worlds = worlds_of(first_robot, n_robots, info.n_robots);
-        if worlds.start < own.start || worlds.end > own.end {
-            let expected = format!("robots of worlds {own:?}");
-            let got = format!("{n_robots} robots from robot {first_robot}");
-            return Err(invalid(paths.py(), "step", expected, got));
+    /// Returns the chosen robots of the lease; by default all.
+    fn part(&self, robots: Option<&Bound<'_, PyAny>>) -> PyResult<Range<u32>> {
+        match robots {
+            Some(robots) => range_of("robots", robots, &self.robots),
+            None => Ok(self.robots.clone()),
         }
-        Ok(moves::paths(paths, n_robots as usize, info.n_moves))
+    }
+
+    fn moves(&self, given: &Bound<'_, PyAny>, robots: &Range<u32>) -> PyResult<Vec<u8>> {
+        paths(given, robots.len(), self.client.get().server.n_moves)
+    }
+
+    fn replace<'py>(
+        &self,
+        py: Python<'py>,
+        what: &str,
+        seconds: f64,
+        ask: impl FnOnce(&mut dyn Backend) -> Result<Vec<WorldInfo>, ConnectionError> + Send,
+    ) -> PyResult<Bound<'py, PyTuple>> {
+        let worlds = self.client.get().ask(py, what, seconds, ask)?;
+        records::worlds(py, &worlds)
     }
 
     /// Sends a request while no other thread uses the connection, so that two threads never send paths for the same
     /// step.
-    fn ask(&self, py: Python<'_>, call: &mut Call<'_>) -> Result<StepAnswer, ConnectionError> {
-        let (server, request) = (self.server.get(), *call.request());
-        let send = |worlds: &mut Worlds| self.lease.send(worlds.backend(), call);
-        let answer = if server.is_brief(request.n_robots) {
-            if worlds_of(request.first_robot, request.n_robots, server.info.n_robots).len() > 1 {
-                server.worlds.check(py).map_err(interruption)?;
+    fn send(&self, py: Python<'_>, call: &mut Call<'_>) -> Result<Answered, ConnectionError> {
+        let (client, request) = (self.client.get(), *call.request());
+        let send = |backend: &mut Box<dyn Backend + Send>| self.lease.send(&mut **backend, call);
+        let answer = if client.is_brief(request.n_robots) {
+            if worlds_of(
+                request.first_robot,
+                request.n_robots,
+                client.server.n_robots,
+            )
+            .len()
+                > 1
+            {
+                client.worlds.check(py).map_err(interruption)?;
             }
-            server.worlds.with_briefly(py, send)
+            client.worlds.with_briefly(py, send)
         } else {
-            server.worlds.with(py, send)
+            client.worlds.with(py, send)
         };
         let answer = answer.map_err(interruption)??;
         if request.operation == Operation::Step as u32 {
-            server.took(answer.0.simulation_nanos, request.n_robots);
+            client.took(answer.0.simulation_nanos, request.n_robots);
         }
         Ok(answer)
     }
 
     /// Logs that a step waits for the paths of other robots.
     fn warn_of_wait(&self, py: Python<'_>, first_robot: u32) -> PyResult<()> {
-        let world = worlds_of(first_robot, 1, self.server.get().info.n_robots).start;
+        let world = worlds_of(first_robot, 1, self.client.get().server.n_robots).start;
         let text = format!(
             "world {world} waits for the paths of its other leased robots; environments of one world need a thread or \
              process each"
         );
-        let logger = py
-            .import("logging")?
-            .call_method1("getLogger", ("emberwatch",))?;
-        logger.call_method1("warning", (text,)).map(|_| ())
+        warn_in_log(py, &text)
     }
+}
+
+fn team_flag(team: bool) -> u32 {
+    if team { FLAG_TEAM_FRAMES } else { 0 }
+}
+
+fn python_range<'py>(py: Python<'py>, range: &Range<u32>) -> PyResult<Bound<'py, PyRange>> {
+    PyRange::new(py, range.start as isize, range.end as isize)
 }

@@ -1,7 +1,7 @@
 //! Options for Python: beliefs about worlds of one robot each, and the plans that a learner chooses from.
 
 use crate::airspace::Given;
-use crate::connection::checked;
+use crate::client::checked;
 use crate::errors::warn;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};

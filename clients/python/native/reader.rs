@@ -1,119 +1,164 @@
-//! Subscribers to the channels on which servers and agents publish.
+//! The classes `Observer`, `TruthReader` and `OutlookReader`: subscribers of what servers and agents publish.
 
-use crate::connection::{checked, duration};
-use crate::errors::{error, raise_of_channel};
+use crate::arguments::{Number, duration};
+use crate::client::checked;
+use crate::errors::{raise, raise_of_channel};
 use crate::owned::Owned;
-use crate::samples::{Published, check_version, frame, outlook, truth};
-use crate::wire::Observer;
-use emberwatch_messages::errors::ChannelError;
-use emberwatch_messages::instance::Instance;
-use emberwatch_messages::message::{AgentHeader, FrameHeader, Header, TruthHeader};
-use emberwatch_messages::sample::Sample;
+use crate::records;
+use crate::refusal::invalid;
+use crate::wire::Observer as Subscriber;
+use emberwatch_messages::message::{AgentHeader, FrameHeader, TruthHeader};
 use pyo3::prelude::*;
-use std::collections::HashMap;
-use std::time::Instant;
+use pyo3::types::PyTuple;
 
-/// A subscription to one channel.
-struct Reading<H: Header> {
-    observer: Observer<H>,
-    /// The only world whose samples are returned; `None` for all worlds.
-    world: Option<u32>,
-    /// The sequence number that is expected next from each publisher.
-    next: HashMap<u32, u64>,
-}
+/// Seconds that an iteration without a timeout waits at a time, because an infinite wait would overflow.
+const HOUR: f64 = 3600.0;
 
-/// A sample, and the number of samples lost before it.
-type Read<H> = Result<Option<(Sample<H>, u64)>, ChannelError>;
-
-impl<H: Header + Published> Reading<H> {
-    fn open(
-        py: Python<'_>,
-        instance: &str,
-        world: Option<u32>,
-        open: fn(&Instance) -> Result<Observer<H>, ChannelError>,
-    ) -> PyResult<Owned<Self>> {
-        let name = checked(py, instance)?;
-        let observer = py.detach(|| open(&name));
-        let observer = observer.map_err(|error| raise_of_channel(py, error))?;
-        let next = HashMap::new();
-        let reading = Self {
-            observer,
-            world,
-            next,
-        };
-        Ok(Owned::new(instance, reading))
-    }
-
-    fn receive(&mut self, seconds: f64) -> Read<H> {
-        let (start, mut n_lost) = (Instant::now(), 0);
-        loop {
-            let left = duration(seconds).saturating_sub(start.elapsed());
-            let Some(sample) = self.observer.receive(left)? else {
-                return Ok(None);
-            };
-            let header = &sample.header;
-            let next = self.next.insert(header.publisher(), header.sequence() + 1);
-            // A number below the expected one means that a new server publishes, so no loss is counted.
-            n_lost += next.map_or(0, |next| header.sequence().saturating_sub(next));
-            if self.world.is_none_or(|world| world == header.world()) {
-                return Ok(Some((sample, n_lost)));
-            }
-        }
-    }
-}
-
-fn next<H: Header + Published + Send>(
+/// Observes an instance. Returns an iterator of frames, which is also a context manager.
+///
+/// The server publishes the current frame of every world when an observer connects, so the same
+/// step of the same episode may arrive twice.
+///
+/// Args:
+///     instance: The instance's name. Its server may start later.
+///     world: The only world to observe; None: all worlds.
+///     timeout: Seconds without a frame after which the iteration ends; None: it never ends.
+#[pyfunction]
+#[pyo3(signature = (instance="default", *, world=None, timeout=None))]
+pub fn observe(
     py: Python<'_>,
-    reading: &Owned<Reading<H>>,
-    seconds: f64,
-) -> PyResult<Option<(Sample<H>, u64)>> {
-    let read = reading.with(py, |reading| reading.receive(seconds))?;
-    let read = read.map_err(|error| raise_of_channel(py, error))?;
-    if let Some((sample, _)) = &read {
-        check_version(&sample.header).map_err(|problem| wrong(py, &problem))?;
-    }
-    Ok(read)
-}
-
-fn wrong(py: Python<'_>, problem: &str) -> PyErr {
-    let text = format!("sample: {problem}");
-    error(py, "EmberwatchError", (text, "bad_answer"))
+    instance: &str,
+    world: Option<Number>,
+    timeout: Option<f64>,
+) -> PyResult<Observer> {
+    Observer::new(py, instance, world, timeout)
 }
 
 macro_rules! reader {
-    ($name:ident, $header:ty, $open:expr, $decode:expr) => {
-        #[doc = "A subscriber to one channel; see `_native.pyi`."]
-        #[pyclass(frozen, module = "emberwatch._native")]
-        pub struct $name(Owned<Reading<$header>>);
+    ($(#[$doc:meta])* $name:ident, $header:ty, $open:path, $record:path, {$($new:tt)*}) => {
+        $(#[$doc])*
+        #[pyclass(frozen, module = "emberwatch")]
+        pub struct $name {
+            #[pyo3(get)]
+            instance: String,
+            subscriber: Owned<Subscriber<$header>>,
+            /// The only world whose samples are returned; `None` for all worlds.
+            world: Option<u32>,
+            timeout: Option<f64>,
+        }
 
         #[pymethods]
         impl $name {
-            #[new]
-            #[pyo3(signature = (instance, world=None))]
-            fn new(py: Python<'_>, instance: &str, world: Option<u32>) -> PyResult<Self> {
-                Reading::open(py, instance, world, $open).map(Self)
-            }
+            $($new)*
 
+            /// Returns the next sample; None if none arrives within `timeout` seconds.
             fn receive<'py>(
                 &self,
                 py: Python<'py>,
-                seconds: f64,
+                timeout: f64,
             ) -> PyResult<Option<Bound<'py, PyAny>>> {
-                let Some((sample, n_lost)) = next(py, &self.0, seconds)? else {
-                    return Ok(None);
-                };
-                let decoded = $decode(py, &sample, n_lost);
-                let fields = decoded.map_err(|problem: String| wrong(py, &problem))?;
-                Ok(Some(fields.into_pyobject(py)?.into_any()))
+                let limit = duration(timeout);
+                let next = |from: &mut Subscriber<$header>| from.next_of(self.world, limit);
+                let read = self.subscriber.with(py, next)?;
+                let read = read.map_err(|error| raise(py, error, "a sample", timeout))?;
+                read.map(|(sample, n_lost)| $record(py, &sample, n_lost)).transpose()
             }
 
+            fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+                slf
+            }
+
+            fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+                loop {
+                    let sample = self.receive(py, self.timeout.unwrap_or(HOUR))?;
+                    if sample.is_some() || self.timeout.is_some() {
+                        return Ok(sample);
+                    }
+                }
+            }
+
+            /// Closes the channel. May be called again.
             fn close(&self, py: Python<'_>) -> PyResult<()> {
-                self.0.close(py)
+                self.subscriber.close(py)
+            }
+
+            fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+                slf
+            }
+
+            #[pyo3(signature = (*_error))]
+            fn __exit__(&self, py: Python<'_>, _error: &Bound<'_, PyTuple>) -> PyResult<()> {
+                self.close(py)
+            }
+        }
+
+        impl $name {
+            fn open(
+                py: Python<'_>,
+                instance: &str,
+                world: Option<Number>,
+                timeout: Option<f64>,
+            ) -> PyResult<Self> {
+                let name = checked(py, instance)?;
+                let subscriber = py.detach(|| $open(&name));
+                let subscriber = subscriber.map_err(|error| raise_of_channel(py, error))?;
+                Ok(Self {
+                    instance: instance.into(),
+                    subscriber: Owned::new(instance, subscriber),
+                    world: world.map(|it| it.0),
+                    timeout,
+                })
             }
         }
     };
 }
 
-reader!(Frames, FrameHeader, Observer::frames, frame);
-reader!(Truths, TruthHeader, Observer::truth, truth);
-reader!(Outlooks, AgentHeader, Observer::agents, outlook);
+reader! {
+    /// A reader of the frames of an instance: one `Frame` for each step of each world.
+    ///
+    /// Iterate over it, or call `receive`. A slow reader loses samples; it never delays the server.
+    Observer, FrameHeader, Subscriber::frames, records::frame, {
+        /// Subscribes; see `observe`.
+        #[new]
+        #[pyo3(signature = (instance="default", *, world=None, timeout=None))]
+        fn new(
+            py: Python<'_>,
+            instance: &str,
+            world: Option<Number>,
+            timeout: Option<f64>,
+        ) -> PyResult<Self> {
+            if let Some(got) = timeout.filter(|it| !(*it >= 0.0)) {
+                let expected = "seconds of at least 0, or None";
+                return Err(invalid(py, "timeout", expected, got));
+            }
+            Self::open(py, instance, world, timeout)
+        }
+    }
+}
+
+reader! {
+    /// A reader of the hidden states of an instance, if its server publishes them: one `Truth` for
+    /// each step of each world.
+    ///
+    /// A slow reader loses samples; it never delays the server.
+    TruthReader, TruthHeader, Subscriber::truth, records::truth, {
+        #[new]
+        #[pyo3(signature = (instance="default"))]
+        fn new(py: Python<'_>, instance: &str) -> PyResult<Self> {
+            Self::open(py, instance, None, None)
+        }
+    }
+}
+
+reader! {
+    /// A reader of the beliefs of the agents of an instance, as `Outlook`.
+    ///
+    /// Agents publish their beliefs only while there is a reader. A slow reader loses samples.
+    OutlookReader, AgentHeader, Subscriber::agents, records::outlook, {
+        #[new]
+        #[pyo3(signature = (instance="default"))]
+        fn new(py: Python<'_>, instance: &str) -> PyResult<Self> {
+            Self::open(py, instance, None, None)
+        }
+    }
+}

@@ -1,17 +1,14 @@
 //! Reads recordings, record by record.
 
 use crate::errors::error;
+use crate::records;
 use crate::refusal::invalid;
-use crate::samples::{frame, truth};
-use emberwatch_messages::recording::{Event, Reader, Record, RecordingError};
+use emberwatch_messages::recording::{Event, Reader, RecordingError};
 use pyo3::prelude::*;
 use std::fs::File;
 use std::io::BufReader;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
-
-/// A record: its time in nanoseconds, its kind, and its JSON text or the fields of its sample.
-type Item<'py> = (u64, &'static str, Bound<'py, PyAny>);
 
 /// An open recording.
 #[pyclass(frozen, module = "emberwatch._native")]
@@ -37,36 +34,26 @@ impl Recording {
         })
     }
 
-    /// Returns the next record; `None` at the end.
-    fn read<'py>(&self, py: Python<'py>) -> PyResult<Option<Item<'py>>> {
+    /// Returns the next record's nanoseconds since the recording began and its `Frame`, `Truth` or
+    /// `ServerInfo`; None at the end.
+    fn read<'py>(&self, py: Python<'py>) -> PyResult<Option<(u64, Bound<'py, PyAny>)>> {
         let record = py.detach(|| {
             let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
             reader.next()
         });
         let record = record.transpose();
         let record = record.map_err(|problem| raise(py, &self.name, problem))?;
-        record.map(|record| item(py, record)).transpose()
+        let Some(record) = record else {
+            return Ok(None);
+        };
+        let n_lost = record.n_lost.into();
+        let made = match record.event {
+            Event::Server(info) => records::server_info(py, &info),
+            Event::Frame(sample) => records::frame(py, &sample, n_lost),
+            Event::Truth(sample) => records::truth(py, &sample, n_lost),
+        };
+        Ok(Some((record.nanos, made?)))
     }
-}
-
-fn item(py: Python<'_>, record: Record) -> PyResult<Item<'_>> {
-    let n_lost = record.n_lost.into();
-    let invariant = "invariant: the reader checks samples";
-    let (kind, value) = match record.event {
-        Event::Server(info) => {
-            let info = serde_json::to_string(&info).expect("invariant: replies serialise");
-            ("server", info.into_pyobject(py)?.into_any())
-        }
-        Event::Frame(sample) => {
-            let fields = frame(py, &sample, n_lost).expect(invariant);
-            ("frame", fields.into_pyobject(py)?.into_any())
-        }
-        Event::Truth(sample) => {
-            let fields = truth(py, &sample, n_lost).expect(invariant);
-            ("truth", fields.into_pyobject(py)?.into_any())
-        }
-    };
-    Ok((record.nanos, kind, value))
 }
 
 /// Creates the exception for a file that could not be read. Its code is "cut" if the recording ends early, "damaged" if

@@ -26,8 +26,10 @@ def modules() -> dict[str, Path]:
 
 @cache
 def imports(path: Path) -> set[str]:
-    """Returns the modules that a file imports, at any place in the file."""
+    """Returns the modules that a file imports, at any place in the file; a stub imports none."""
     found = set()
+    if path.suffix == ".pyi":
+        return found
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
@@ -40,7 +42,7 @@ def imports(path: Path) -> set[str]:
 
 def test_there_are_no_import_cycles() -> None:
     graph = {name: imports(path) & modules().keys() for name, path in modules().items()}
-    assert len(graph) > 30 and "emberwatch.client.wire" in graph["emberwatch.client.connection"]
+    assert len(graph) > 30 and "emberwatch.client.wire" in graph["emberwatch.client.observer"]
     order = list(TopologicalSorter(graph).static_order())
     assert order.index("emberwatch.errors") < order.index("emberwatch.envs.path_env")
 

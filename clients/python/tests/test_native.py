@@ -62,13 +62,6 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
         client.status()
 
 
-def test_a_lease_refuses_robots_of_others() -> None:
-    lease = server(worlds=4).connect().acquire(1, 2)
-    for first, n in ((0, 1), (2, 2), (0, 4), (2**32 - 1, 1)):
-        with refuses("step: expected robots of worlds 1..3"):
-            lease.native.step(np.zeros((n, 6), np.uint8), first, n, 0, 5.0)
-
-
 def test_numbers_out_of_range_are_refused() -> None:
     right = {"height": 2, "width": 2, "burn_in": 0}
     for wrong, words in (

@@ -18,8 +18,7 @@ import gymnasium
 
 from emberwatch._native import VERSION
 from emberwatch.client import recording
-from emberwatch.client.client import Client, connect, embed
-from emberwatch.client.lease import Lease
+from emberwatch.client.client import Client, Lease, connect, embed
 from emberwatch.client.observer import (
     Frame,
     Observer,

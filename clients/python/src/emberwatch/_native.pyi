@@ -4,31 +4,32 @@ Calls that wait release the interpreter lock, and Ctrl-C interrupts them. Open o
 process that made them: using one in a forked child raises an error with code `"forked"`.
 """
 
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
-from typing import Any, Literal, Protocol, final
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emberwatch.client.observer import Frame, Outlook, Truth
+from emberwatch.client.replies import LeftBelief, ServerInfo, ServerStatus, WorldInfo
+from emberwatch.client.wire import StepResult
+
+_Sample = TypeVar("_Sample")
+
 _Doubles = NDArray[np.float64]
 
 class _Airspace(Protocol):
-    """The attributes of an `Airspace` that the native module reads."""
-
     @property
     def radius(self) -> int: ...
     @property
     def no_fly(self) -> NDArray[np.bool_] | None: ...
 
 class _Text(Protocol):
-    """A model or a description of recorded states."""
-
     @property
     def toml(self) -> str: ...
 
 class _Spec(Protocol):
-    """The attributes of a `WorldSpec` that the native module reads."""
-
     @property
     def height(self) -> int: ...
     @property
@@ -71,49 +72,22 @@ MAX_SIDE: int
 #: Maximum number of states of a model, and maximum number of its observations.
 MAX_VALUES: int
 
-def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
-    """Returns the texts of built-in files by name; `states` are descriptions of recorded states."""
-
-def world_settings() -> dict[str, tuple[int, int] | None]:
-    """Returns the range of each setting of worlds, by its name in `config/server.toml`.
-
-    The range is None unless the setting is a number.
-    """
-
-def explain(status: int, detail: int) -> tuple[str, str] | None:
-    """Returns the name and the message of a status code; None if the code is not a refusal."""
+def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]: ...
+def world_settings() -> dict[str, tuple[int, int] | None]: ...
+def explain(status: int, detail: int) -> tuple[str, str] | None: ...
 
 @final
 class CheckedSettings:
-    """Settings of worlds in this process, with the files that they name, which are read only here.
-
-    A pickle reads the files again, and refuses files that have changed.
-    """
-
-    def __new__(cls, settings: str) -> CheckedSettings:
-        """Reads and checks settings: JSON with the keys of `config/server.toml`.
-
-        Warns about start cells that no-fly cells enclose.
-        """
-
-    def with_worlds(self, worlds: int) -> CheckedSettings:
-        """Returns the same settings with another number of worlds."""
-
+    def __new__(cls, settings: str) -> CheckedSettings: ...
+    def with_worlds(self, worlds: int) -> CheckedSettings: ...
     @property
-    def settings(self) -> str:
-        """All settings with their defaults, as JSON."""
-
+    def settings(self) -> str: ...
     @property
-    def description(self) -> str:
-        """Text of the model file with all maps, or of the description of recorded states."""
-
+    def description(self) -> str: ...
     @property
-    def task(self) -> tuple[str, int, int, int, int, int, str, int] | None:
-        """Name, moves, robots, steps, first and end of test seeds, prefix and version of ids."""
-
+    def task(self) -> tuple[str, int, int, int, int, int, str, int] | None: ...
     @property
-    def worlds_fingerprint(self) -> str:
-        """Digits that identify the worlds, apart from their seeds."""
+    def worlds_fingerprint(self) -> str: ...
 
 _Numbers = tuple[float, bool, bool, int, int, NDArray[np.int64]]
 _Columns = tuple[
@@ -127,12 +101,7 @@ _Columns = tuple[
 ]
 
 @final
-class Answer:
-    """The answer to a step or an observation, for consecutive robots.
-
-    It shares its memory with no other answer. Results are bytes in the layout of PROTOCOL.md.
-    """
-
+class StepAnswer:
     def __new__(
         cls,
         team: int,
@@ -143,254 +112,247 @@ class Answer:
         flags: int,
         simulation_nanos: int,
         payload: NDArray[np.uint8],
-    ) -> Answer:
-        """Wraps a payload: results of the worlds, results of the robots, frames.
-
-        `team`: number of robots in each world.
-        """
-
+    ) -> StepAnswer: ...
+    def __getnewargs__(self) -> tuple[object, ...]: ...
     @property
     def first_robot(self) -> int: ...
     @property
     def simulation_nanos(self) -> int: ...
     @property
-    def frames(self) -> NDArray[np.uint8]:
-        """One frame for each robot, or for each world's team, `(n, H, W)`; a view."""
-
+    def frames(self) -> NDArray[np.uint8]: ...
     @property
-    def worlds(self) -> NDArray[np.uint8]:
-        """Results of the worlds as bytes; a view."""
-
+    def worlds(self) -> NDArray[np.void]: ...
     @property
-    def robots(self) -> NDArray[np.uint8]:
-        """Results of the robots as bytes; a view."""
-
+    def robots(self) -> NDArray[np.void]: ...
     @property
-    def results(self) -> NDArray[np.uint8]:
-        """One `wire.RESULT_DTYPE` for each robot, as bytes; a new array."""
-
+    def results(self) -> NDArray[np.void]: ...
     @property
-    def world_of_robots(self) -> NDArray[np.int64]:
-        """The index of each robot's world among the answer's worlds, `(n_robots,)`."""
+    def world_of(self) -> NDArray[np.int64]: ...
+    def result(self, index: int = 0) -> StepResult: ...
+    def numbers(self, pays: int) -> _Numbers: ...
 
-    def result(self, index: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """Returns the fields of one robot's `WorldResult` and `RobotResult`."""
+def connect(instance: str = "default", *, timeout: float = 5.0, wait: float = 0.0) -> Client: ...
 
-    def numbers(self, pays: int) -> _Numbers:
-        """Returns the results of the first robot.
-
-        The tuple has reward, terminated, truncated, step, number of distinct visited cells, and
-        cell (a new array, `(1, 2)`). `pays` chooses the reward: 0 share, 1 team, 2 marginal.
-        """
-
-def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
-    """Returns the results of many robots as new arrays, from bytes of `wire.RESULT_DTYPE`.
-
-    The tuple has rewards, terminated, truncated, steps and numbers of distinct visited cells,
-    `(n,)` each; cells, `(n, 2)`; and whether any episode is over. `pays`: as in `Answer.numbers`.
-    """
-
-def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8] | None:
-    """Checks paths; returns them as bytes, `(n_robots, n_moves)`, or None as `Lease.step` does."""
-
-class Connection:
-    """A connection to a server, or worlds in this process. Calls of several threads take turns."""
-
-    def __init__(self, instance: str, client: str, seconds: float) -> None:
-        """Connects to a server; `client` names this program in the server's log."""
-
+@final
+class Client:
+    def __new__(cls, instance: str = "default", *, timeout: float = 5.0) -> Client: ...
     @staticmethod
-    def embedded(settings: CheckedSettings, seed: int | None = None) -> Connection:
-        """Creates worlds in this process; `seed` replaces the first world's seed."""
-
-    def truths(self, first_world: int, n_worlds: int) -> list[dict[str, Any]]:
-        """Returns the hidden states of worlds in this process, as the fields of `Truth`.
-
-        Refused on a connection to a server.
-        """
-
-    def snapshot(self) -> bytes:
-        """Returns the state of all worlds in this process; refused on a connection to a server."""
-
-    def restore(self, bytes: bytes) -> None:
-        """Replaces all worlds in this process by the worlds of a `snapshot`; refuses others."""
-
+    def embedded(settings: CheckedSettings, seed: int | None = None) -> Client: ...
     @property
-    def info(self) -> str:
-        """The server's reply to `hello`, as JSON."""
+    def info(self) -> ServerInfo: ...
+    @property
+    def instance(self) -> str: ...
+    def acquire(
+        self,
+        first_robot: int = 0,
+        n_robots: int = 1,
+        *,
+        takeover: bool = False,
+        ttl: float | None = None,
+        timeout: float = 600.0,
+    ) -> Lease: ...
+    def observe(
+        self,
+        first_robot: int = 0,
+        n_robots: int = 1,
+        *,
+        team: bool = False,
+        timeout: float = 5.0,
+    ) -> StepAnswer: ...
+    def recall(
+        self,
+        step: int,
+        first_robot: int = 0,
+        n_robots: int = 1,
+        *,
+        team: bool = False,
+        timeout: float = 5.0,
+    ) -> StepAnswer: ...
+    def snapshot(
+        self,
+        path: str | PathLike[str],
+        first_world: int = 0,
+        n_worlds: int | None = None,
+        *,
+        timeout: float = 600.0,
+    ) -> tuple[WorldInfo, ...]: ...
+    def belief(self, robot: int = 0, *, timeout: float = 5.0) -> LeftBelief | None: ...
+    def status(self, *, timeout: float = 5.0) -> ServerStatus: ...
+    def shutdown(self, *, timeout: float = 5.0) -> None: ...
+    def control(self, request: Mapping[str, Any], *, timeout: float) -> dict[str, Any]: ...
+    def truths(self, worlds: range) -> list[Truth]: ...
+    def clone_state(self) -> bytes: ...
+    def restore_state(self, worlds: bytes) -> None: ...
+    def close(self) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *_error: object) -> None: ...
 
-    def control(self, text: bytes, what: str, seconds: float) -> str:
-        """Sends a JSON request, and returns the JSON answer; `what` names it in errors."""
-
+@final
+class Lease:
+    @property
+    def client(self) -> Client: ...
+    @property
+    def number(self) -> int: ...
+    @property
+    def ttl(self) -> float: ...
+    @property
+    def robots(self) -> range: ...
+    @property
+    def worlds(self) -> range: ...
+    @property
+    def start(self) -> tuple[WorldInfo, ...]: ...
     def step(
         self,
-        operation: int,
-        lease: int,
-        first_robot: int,
-        n_robots: int,
-        n_moves: int,
-        flags: int,
-        body: bytes,
-        seconds: float,
-    ) -> Answer:
-        """Sends a raw request to the service `step`."""
-
-    def close(self) -> None:
-        """Closes the connection. May be called again."""
-
-class Options:
-    """Beliefs about worlds of one robot each, and plans for the robots. Worlds count from 0."""
-
-    def __init__(
+        paths: ArrayLike,
+        *,
+        robots: range | None = None,
+        full: bool = False,
+        team: bool = False,
+        timeout: float = 5.0,
+    ) -> StepAnswer: ...
+    def fly(
         self,
+        paths: ArrayLike,
+        *,
+        robots: range | None = None,
+        accepts_late: bool = False,
+        timeout: float = 5.0,
+    ) -> tuple[StepAnswer, int]: ...
+    def observe(
+        self, *, robots: range | None = None, team: bool = False, timeout: float = 5.0
+    ) -> StepAnswer: ...
+    def reset(
+        self,
+        seeds: Iterable[int | None] | None = None,
+        *,
+        worlds: Sequence[int] | None = None,
+        timeout: float = 600.0,
+    ) -> tuple[WorldInfo, ...]: ...
+    def restore(
+        self,
+        path: str | PathLike[str],
+        *,
+        worlds: range | None = None,
+        first: int = 0,
+        timeout: float = 600.0,
+    ) -> tuple[WorldInfo, ...]: ...
+    def fork(self, source: int, target: int, *, timeout: float = 5.0) -> tuple[WorldInfo, ...]: ...
+    def leave_belief(
+        self,
+        result: StepResult,
+        kind: str,
+        data: bytes,
+        *,
+        robot: int | None = None,
+        timeout: float = 5.0,
+    ) -> None: ...
+    def renew(self, *, timeout: float = 600.0) -> None: ...
+    def release(self, *, timeout: float = 5.0) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None: ...
+
+def observe(
+    instance: str = "default", *, world: int | None = None, timeout: float | None = None
+) -> Observer: ...
+
+class _Reader(Generic[_Sample]):
+    @property
+    def instance(self) -> str: ...
+    def receive(self, timeout: float) -> _Sample | None: ...
+    def __iter__(self) -> Self: ...
+    def __next__(self) -> _Sample: ...
+    def close(self) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *_error: object) -> None: ...
+
+@final
+class Observer(_Reader[Frame]):
+    def __new__(
+        cls,
+        instance: str = "default",
+        *,
+        world: int | None = None,
+        timeout: float | None = None,
+    ) -> Observer: ...
+
+@final
+class TruthReader(_Reader[Truth]):
+    def __new__(cls, instance: str = "default") -> TruthReader: ...
+
+@final
+class OutlookReader(_Reader[Outlook]):
+    def __new__(cls, instance: str = "default") -> OutlookReader: ...
+
+@final
+class Recording:
+    def __new__(cls, path: str) -> Recording: ...
+    def read(self) -> tuple[int, ServerInfo | Frame | Truth] | None: ...
+
+def columns(results: NDArray[np.uint8], pays: int) -> _Columns: ...
+def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8] | None: ...
+
+@final
+class Options:
+    def __new__(
+        cls,
         spec: _Spec,
         n_worlds: int,
         estimator: str | None,
         checkpoint: tuple[str, bytes] | None,
         prior: str,
         watched: tuple[str, int] | None,
-    ) -> None:
-        """Checks all arguments. `checkpoint`: the path, for errors, and the bytes of the file.
-
-        `watched`: instance on which beliefs are published, and the number of world 0 there.
-        """
-
+    ) -> Options: ...
     @property
-    def estimator(self) -> str:
-        """Name of the estimator that computes the beliefs."""
-
-    def start_episodes(self, worlds: list[int], seeds: list[int]) -> None:
-        """Starts episodes in `worlds` with these seeds; resets the beliefs about these worlds."""
-
-    def take_over(self, world: int, kind: str, data: bytes) -> bool:
-        """Loads another client's belief about the current step; False if it does not fit."""
-
-    def left(self, world: int) -> tuple[str, bytes] | None:
-        """Returns the kind and the bytes of a belief, for the next client."""
-
-    def see(self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]) -> None:
-        """Updates beliefs with an earlier step. `results`: as in `plan`; `frames`: `(n, H, W)`."""
-
+    def estimator(self) -> str: ...
+    def start_episodes(self, worlds: list[int], seeds: list[int]) -> None: ...
+    def take_over(self, world: int, kind: str, data: bytes) -> bool: ...
+    def left(self, world: int) -> tuple[str, bytes] | None: ...
+    def see(
+        self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]
+    ) -> None: ...
     def plan(
         self,
         worlds: list[int],
         results: NDArray[np.uint8],
         frames: NDArray[np.uint8] | None,
         flown: list[int] | None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Updates beliefs with the current step, unless `frames` is None, then plans.
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]: ...
+    def close(self) -> None: ...
 
-        `results`: bytes of `wire.RESULT_DTYPE`. `flown`: the option flown in each world.
-
-        Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
-        worlds, as new arrays.
-        """
-
-    def close(self) -> None:
-        """Drops all beliefs. May be called again."""
-
+@final
 class Flights:
-    """The current path of each robot, up to its latest move; one row for each robot.
-
-    `reward` is the reward of each state. If given, each cell pays the reward of its hidden state
-    when the path first visits it. A copied or unpickled object has no moves.
-    """
-
-    def __init__(
-        self,
+    def __new__(
+        cls,
         n_rows: int,
         height: int,
         width: int,
         n_moves: int,
         reward: list[float] | None,
         airspace: _Airspace | None = None,
-    ) -> None: ...
+    ) -> Flights: ...
     @property
-    def robots(self) -> NDArray[np.int64]:
-        """Row and column of each robot. All properties are new arrays."""
-
+    def robots(self) -> NDArray[np.int64]: ...
     @property
-    def n_made(self) -> NDArray[np.int64]:
-        """Number of moves made."""
-
+    def n_made(self) -> NDArray[np.int64]: ...
     @property
-    def visited(self) -> NDArray[np.uint8]:
-        """255 in the visited cells, otherwise 0."""
-
+    def visited(self) -> NDArray[np.uint8]: ...
     @property
-    def paid(self) -> NDArray[np.float64]:
-        """Sum of the rewards of the moves made."""
-
+    def paid(self) -> NDArray[np.float64]: ...
     @property
-    def masks(self) -> NDArray[np.int8]:
-        """1 for each move that takes a robot to another cell, otherwise 0, `(n_rows, 4)`.
-
-        If no move does, the whole row is 1.
-        """
-
+    def masks(self) -> NDArray[np.int8]: ...
     def start_paths(
         self,
         begun: NDArray[np.bool_],
         robots: NDArray[np.int64],
         states: NDArray[np.uint8] | None,
-    ) -> None:
-        """Begins paths in the rows `begun`; `robots` and `states` have an entry for every row."""
-
-    def completes(self) -> NDArray[np.bool_]:
-        """Returns the mask of the rows whose next move completes their path."""
-
-    def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Returns the paths that `actions` complete as last moves, `(n_rows, T)`; makes no move."""
-
-    def made(self, row: int) -> NDArray[np.uint8]:
-        """Returns the moves made by one robot."""
-
-    def move(self, moved: NDArray[np.bool_], actions: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Makes a move in the rows `moved`; returns the reward of each row."""
-
-class Lease:
-    """The right to fly consecutive robots, and the step k of each of their worlds."""
-
-    def __init__(
-        self, server: Connection, number: int, first_robot: int, n_robots: int
     ) -> None: ...
-    def step(
-        self, paths: ArrayLike, first_robot: int, n_robots: int, flags: int, seconds: float
-    ) -> Answer | None:
-        """Flies a path with each robot, for the next step of its world.
-
-        Returns None if the paths are not a plain array of int64 or uint8, or are invalid: then
-        `as_moves` converts or refuses them.
-        """
-
-    def send_paths(
-        self,
-        paths: ArrayLike,
-        first_robot: int,
-        n_robots: int,
-        accepts_late: bool,
-        seconds: float,
-    ) -> tuple[Answer, int] | None:
-        """Like `step`, but repeats the request until the worlds have moved; see `client.Lease`."""
-
-    def observe(self, first_robot: int, n_robots: int, flags: int, seconds: float) -> Answer:
-        """Returns the last results and frames again; steps continue from the observed step."""
-
-    def note(self, world: int, step: int) -> None:
-        """Sets the step that a world is at."""
-
-    @property
-    def steps(self) -> list[int]:
-        """The step of each world."""
+    def completes(self) -> NDArray[np.bool_]: ...
+    def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
+    def made(self, row: int) -> NDArray[np.uint8]: ...
+    def move(self, moved: NDArray[np.bool_], actions: NDArray[np.uint8]) -> NDArray[np.float64]: ...
 
 @final
 class Windows:
-    """A square of cells around each robot, one row per robot: the parts `local` and `recent`.
-
-    The channels about the world come first. Three channels follow: 255 in the cells that this path
-    has visited; 255 off the grid and in no-fly cells; 255 times the share of remaining moves.
-    """
-
     def __new__(
         cls,
         n_rows: int,
@@ -398,104 +360,33 @@ class Windows:
         width: int,
         side: int,
         n_of_world: int,
-        airspace: _Airspace,
-    ) -> Windows:
-        """`side`: side in cells, odd; `n_of_world`: number of channels about the world."""
+        given: _Airspace,
+    ) -> Windows: ...
+    def start_paths(self, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None: ...
+    def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None: ...
+    def around(self, flights: Flights) -> NDArray[np.uint8]: ...
 
-    def start_paths(self, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None:
-        """Begins paths in the rows `begun`, with channels `(n_begun, H, W, n_of_world)`."""
-
-    def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None:
-        """Marks the visited cells, and clears the world channels of cells that have paid."""
-
-    def around(self, flights: Flights) -> NDArray[np.uint8]:
-        """Returns the windows of all robots, `(n_rows, side, side, channels)`; a new array."""
-
-class Frames:
-    """A reader of `Frame`s, of one world or of all worlds."""
-
-    def __init__(self, instance: str, world: int | None = None) -> None: ...
-    def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Returns the fields of the next sample; None if none arrives in time."""
-
-    def close(self) -> None:
-        """Closes the reader. May be called again."""
-
-class Truths:
-    """A reader of `Truth`s, of one world or of all worlds."""
-
-    def __init__(self, instance: str, world: int | None = None) -> None: ...
-    def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Returns the fields of the next sample; None if none arrives in time."""
-
-    def close(self) -> None:
-        """Closes the reader. May be called again."""
-
-class Outlooks:
-    """A reader of `Outlook`s, of one world or of all worlds."""
-
-    def __init__(self, instance: str, world: int | None = None) -> None: ...
-    def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Returns the fields of the next sample; None if none arrives in time."""
-
-    def close(self) -> None:
-        """Closes the reader. May be called again."""
-
-class Recording:
-    """A reader of a recording.
-
-    An error with code "cut" or "damaged" means that all earlier records are complete.
-    """
-
-    def __init__(self, path: str | bytes | PathLike[str]) -> None: ...
-    def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
-        """Returns nanoseconds, kind, and a server's JSON or a sample's fields; None at the end."""
-
-def checkpoint_bytes(path: str) -> bytes:
-    """Returns the bytes of a checkpoint; refuses folders, pipes and files that are too large."""
-
-def option_names() -> tuple[list[str], list[str]]:
-    """Returns the names of the options, and of the features that describe each plan."""
-
-def read_model(text: str) -> dict[str, Any]:
-    """Returns the fields of `Model` except `toml`; `ValueError` if the text is not a model file."""
-
-def model_text(name: str) -> str:
-    """Returns the text of a model with all maps, by its name, path, or the text of its file."""
-
-def model_with_radius(text: str, radius: int) -> str:
-    """Returns the text of a model file with another sensor radius."""
-
-def description_with_radius(text: str, radius: int) -> str:
-    """Returns the text of a description with another sensor radius."""
-
-def read_description(text: str) -> dict[str, Any]:
-    """Returns the fields of `Description` except `toml`; `ValueError` if the text is invalid."""
+def checkpoint_bytes(path: str) -> bytes: ...
+def option_names() -> tuple[list[str], list[str]]: ...
+def read_model(text: str) -> dict[str, Any]: ...
+def model_text(name: str) -> str: ...
+def model_with_radius(text: str, radius: int) -> str: ...
+def description_with_radius(text: str, radius: int) -> str: ...
+def read_description(text: str) -> dict[str, Any]: ...
 
 @final
 class Dynamics:
-    """The transition of worlds for one model on one grid; `Model.advance` checks the arguments."""
-
-    def __new__(cls, model: str, height: int, width: int) -> Dynamics:
-        """`model`: the text of a model file."""
-
+    def __new__(cls, model: str, height: int, width: int) -> Dynamics: ...
     def advance(
         self, states: NDArray[np.uint8], seeds: NDArray[np.uint64], step: int
-    ) -> NDArray[np.uint8]:
-        """Returns the states one step later, `(n, H, W)`, as a new array; `seeds`: `(n,)`."""
+    ) -> NDArray[np.uint8]: ...
 
+@final
 class Estimators:
-    """Beliefs of one kind about n worlds; `Belief` checks the arguments.
-
-    `chosen`, `(n,)`, is the mask of the worlds that a call applies to.
-    """
-
     @staticmethod
     def known(
         model: str, prior: NDArray[np.float32], kind: str, n_worlds: int | None
-    ) -> Estimators:
-        """Builds beliefs from a model file's text. All worlds share the `prior`, `(S, H, W)`."""
-
+    ) -> Estimators: ...
     @staticmethod
     def load(
         file: str,
@@ -503,27 +394,16 @@ class Estimators:
         kind: str | None,
         model: str | None,
         n_worlds: int | None,
-    ) -> Estimators:
-        """Loads beliefs; `grid` is height and width, `model` a model file's text.
-
-        A file of `save` takes no other arguments.
-        """
-
+    ) -> Estimators: ...
     def copy(self) -> Estimators: ...
     def to_bytes(self) -> bytes: ...
     @staticmethod
     def from_bytes(bytes: bytes) -> Estimators: ...
     def save(self, file: str) -> None: ...
-    def steps(self) -> list[int | None]:
-        """Returns the number of predictions of each world; None after an interrupted call."""
-
-    def sample(self, seed: int) -> NDArray[np.uint8]:
-        """Returns states drawn cell by cell, as a new array, `(n, H, W)`."""
-
+    def steps(self) -> list[int | None]: ...
+    def sample(self, seed: int) -> NDArray[np.uint8]: ...
     @property
-    def is_single(self) -> bool:
-        """Whether arrays have no axis for worlds."""
-
+    def is_single(self) -> bool: ...
     @property
     def kind(self) -> str: ...
     @property
@@ -533,32 +413,19 @@ class Estimators:
     @property
     def n_observations(self) -> int: ...
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Number of worlds, height and width."""
-
-    def belief(self) -> NDArray[np.float32]:
-        """Returns the beliefs as a new array, `(S, n, H, W)`."""
-
-    def entropy(self) -> NDArray[np.float32]:
-        """Returns the entropy of each cell in nats, as a new array, `(n, H, W)`."""
-
+    def shape(self) -> tuple[int, int, int]: ...
+    def belief(self) -> NDArray[np.float32]: ...
+    def entropy(self) -> NDArray[np.float32]: ...
     def reset(self, chosen: NDArray[np.bool_], keeps_correlations: bool) -> None: ...
-    def correct(self, frames: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> None:
-        """Corrects the beliefs about the chosen worlds; one frame for each world, `(n, H, W)`."""
-
+    def correct(self, frames: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> None: ...
     def predict(self, chosen: NDArray[np.bool_]) -> None: ...
-    def scores(self, states: NDArray[np.uint8], target: int) -> tuple[_Doubles, _Doubles, _Doubles]:
-        """Returns log loss, Brier score and accuracy for states `(n, H, W)`, `(n,)` each."""
+    def scores(
+        self, states: NDArray[np.uint8], target: int
+    ) -> tuple[_Doubles, _Doubles, _Doubles]: ...
+    def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]: ...
 
-    def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]:
-        """Returns log-likelihoods of frames `(n, H, W)` and numbers of observed cells, `(n,)`."""
-
-def belief_kinds() -> list[tuple[str, tuple[str, bool, bool, bool]]]:
-    """Returns the name of each kind of belief that frames can correct, and the fields of `Kind`."""
-
-def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
-    """Returns the share of 64 simulated worlds with each cell in each state, `(S, H, W)`."""
-
+def belief_kinds() -> list[tuple[str, tuple[str, bool, bool, bool]]]: ...
+def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]: ...
 def beam_search(
     values: NDArray[np.float32],
     robots: NDArray[np.int64],
@@ -566,16 +433,10 @@ def beam_search(
     n_moves: int,
     width: int,
     airspace: _Airspace | None = None,
-) -> NDArray[np.uint8]:
-    """Returns a path for each world, `(n, n_moves)`.
-
-    `values`: `(n, H, W)`; `robots`: `(n, 2)`; `keys`: `(n,)`, seeds that break ties.
-    """
+) -> NDArray[np.uint8]: ...
 
 @final
 class MeritTally:
-    """Running figures of merit of several worlds."""
-
     def __new__(cls, n_worlds: int, height: int, width: int, target: int) -> MeritTally: ...
     def update(
         self,
@@ -584,14 +445,9 @@ class MeritTally:
         n_hits: NDArray[np.uint32],
         n_burning: NDArray[np.uint32],
         states: NDArray[np.uint8] | None,
-    ) -> None:
-        """Adds a step; shapes `(n, H, W)`, `(n, R, 2)`, `(n,)`, `(n,)` and `(n, H, W)`."""
+    ) -> None: ...
+    def merit(
+        self, world: int
+    ) -> tuple[int | None, int | None, float | None, float | None, float]: ...
 
-    def merit(self, world: int) -> tuple[int | None, int | None, float | None, float | None, float]:
-        """Returns the fields of `Merit`."""
-
-def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
-    """Checks that each row has one integer below `n_choices`; returns the integers as bytes.
-
-    Returns None if the argument is not a plain array, or is invalid.
-    """
+def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None: ...

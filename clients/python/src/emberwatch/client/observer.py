@@ -1,27 +1,26 @@
-"""Observers of an instance: readers of frames, hidden states and beliefs.
+"""What observers of an instance receive: frames, hidden states and beliefs.
 
 For example `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.reward)`. An
 observer may be opened before the server starts, and stays open when the server ends.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Generic, TypeVar
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-import emberwatch._native as _native
-from emberwatch.client.connection import Closable
+from emberwatch._native import Observer as Observer
+from emberwatch._native import OutlookReader as OutlookReader
+from emberwatch._native import TruthReader as TruthReader
+from emberwatch._native import observe as observe
 from emberwatch.client.wire import RobotResult, WorldResult
-from emberwatch.errors import EmberwatchError, RequestTimeoutError, invalid
+from emberwatch.errors import EmberwatchError, RequestTimeoutError
 
 #: Seconds to wait for the samples of given steps before a new reader is opened.
 _RETRY: Final = 0.02
-
-_Sample = TypeVar("_Sample")
-_Step = TypeVar("_Step", bound="Frame | Truth")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,92 +112,18 @@ class Outlook:
     n_lost: int
 
 
-class Reader(Closable, Generic[_Sample]):
-    """A subscriber of one channel. A slow reader loses samples; it never delays the publisher."""
+class Newest:
+    """The newest published hidden states of consecutive worlds."""
 
-    def __init__(
-        self, instance: str, native: _native.Frames | _native.Truths | _native.Outlooks
-    ) -> None:
-        self.instance: Final = instance
-        self._native = native
-
-    def close(self) -> None:
-        self._native.close()
-
-    def receive(self, timeout: float) -> _Sample | None:
-        """Returns the next sample; `None` if none arrives within `timeout` seconds."""
-        fields = self._native.receive(timeout)
-        return None if fields is None else self._made(fields)
-
-    def _made(self, fields: dict[str, Any]) -> _Sample:
-        raise NotImplementedError
-
-
-class Observer(Reader[Frame]):
-    """A reader of the frames of an instance: one sample for each step of each world.
-
-    Iterate over it, or call `receive`.
-    """
-
-    def __init__(
-        self, instance: str = "default", *, world: int | None = None, timeout: float | None = None
-    ) -> None:
-        """Subscribes; see `observe`."""
-        super().__init__(instance, _native.Frames(instance, world))
-        self._timeout = timeout
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yields frames as they arrive, until none arrives for `timeout` seconds (None: never)."""
-        while True:
-            # Waits an hour at a time, because an infinite wait would overflow.
-            frame = self.receive(3600.0 if self._timeout is None else self._timeout)
-            if frame is not None:
-                yield frame
-            elif self._timeout is not None:
-                return
-
-    def _made(self, fields: dict[str, Any]) -> Frame:
-        return frame_of(fields)
-
-
-class TruthReader(Reader[Truth]):
-    """A reader of the hidden states of an instance, if its server publishes them."""
-
-    def __init__(self, instance: str = "default") -> None:
-        super().__init__(instance, _native.Truths(instance))
-
-    def _made(self, fields: dict[str, Any]) -> Truth:
-        return Truth(**fields)
-
-
-class OutlookReader(Reader[Outlook]):
-    """A reader of the beliefs of the agents of an instance.
-
-    Agents publish their beliefs only while there is a reader.
-    """
-
-    def __init__(self, instance: str = "default") -> None:
-        super().__init__(instance, _native.Outlooks(instance))
-
-    def _made(self, fields: dict[str, Any]) -> Outlook:
-        first, n_robots = fields["robots"]
-        fields["states"] = tuple(fields["states"])
-        fields["robots"] = range(first, first + n_robots)
-        return Outlook(**fields)
-
-
-class Newest(Generic[_Step]):
-    """The newest samples of consecutive worlds, for infos, pictures and rewards of single moves."""
-
-    def __init__(self, subscribe: Callable[[], Reader[_Step]], worlds: range) -> None:
-        self._subscribe = subscribe
-        self._reader: Reader[_Step] | None = subscribe()
+    def __init__(self, instance: str, worlds: range) -> None:
+        self._instance = instance
+        self._reader: TruthReader | None = TruthReader(instance)
         self._worlds = worlds
-        self._samples: dict[int, _Step] = {}
+        self._samples: dict[int, Truth] = {}
 
     def at(
         self, moments: Sequence[tuple[int, int, int]], timeout: float, first: int = 0
-    ) -> list[_Step]:
+    ) -> list[Truth]:
         """Waits for the samples of the given moments, and returns them.
 
         Args:
@@ -219,7 +144,7 @@ class Newest(Generic[_Step]):
                 self.close()
                 asked, n_asked, n_lost = now, n_asked + 1, 0
             if self._reader is None:  # closed above, or an earlier call was interrupted there
-                self._reader = self._subscribe()
+                self._reader = TruthReader(self._instance)
             sample = self._reader.receive(min(timeout, _RETRY))
             if sample is not None:
                 n_lost += sample.n_lost
@@ -237,17 +162,17 @@ class Newest(Generic[_Step]):
         return None if sample is None else sample.moment
 
 
-class Present(Closable):
+class Present:
     """The current hidden states of worlds in this process, with the interface of `Newest`."""
 
-    def __init__(self, read: Callable[[range], list[dict[str, Any]]]) -> None:
+    def __init__(self, read: Callable[[range], list[Truth]]) -> None:
         self._read = read
 
     def at(
         self, moments: Sequence[tuple[int, int, int]], _timeout: float, first: int = 0
     ) -> list[Truth]:
         """Returns the hidden states of the given moments, as `Newest.at` does."""
-        truths = [Truth(**fields) for fields in self._read(range(first, first + len(moments)))]
+        truths = self._read(range(first, first + len(moments)))
         got = [truth.moment for truth in truths]
         if got != list(moments):
             raise EmberwatchError(f"truth: expected worlds at {moments}, got {got}", "late")
@@ -255,31 +180,3 @@ class Present(Closable):
 
     def close(self) -> None:
         pass
-
-
-def observe(
-    instance: str = "default", *, world: int | None = None, timeout: float | None = None
-) -> Observer:
-    """Observes an instance. Returns an iterator of frames, which is also a context manager.
-
-    The server publishes the current frame of every world when an observer connects, so the same
-    step of the same episode may arrive twice.
-
-    Args:
-        instance: The instance's name. Its server may start later.
-        world: The only world to observe; None: all worlds.
-        timeout: Seconds without a frame after which the iteration ends; None: it never ends.
-    """
-    if timeout is not None and not timeout >= 0:
-        raise invalid("timeout", "seconds of at least 0, or None", timeout)
-    return Observer(instance, world=world, timeout=timeout)
-
-
-def frame_of(fields: dict[str, Any]) -> Frame:
-    """Makes a `Frame` from the fields of a sample."""
-    fields["result"] = WorldResult(*fields["result"])
-    fields["robots"] = tuple(
-        RobotFrame(result=RobotResult(*result), frame=frame, path=path)
-        for result, frame, path in fields["robots"]
-    )
-    return Frame(**fields)

@@ -4,16 +4,14 @@ For example `for record in emberwatch.recording.read("lab.recording", world=0): 
 no server, and opens no shared memory.
 """
 
-import json
 import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import emberwatch._native as _native
-from emberwatch.client.observer import Frame, Truth, frame_of
+from emberwatch.client.observer import Frame, Truth
 from emberwatch.client.replies import ServerInfo
-from emberwatch.client.replies import record as record_from_reply
 from emberwatch.errors import EmberwatchError
 
 
@@ -79,9 +77,8 @@ def _records(path: str | os.PathLike[str]) -> Iterator[Record]:
     file = _native.Recording(os.fspath(path))
     server = None
     while (record := file.read()) is not None:
-        nanos, kind, content = record
-        if kind == "server":
-            server = record_from_reply(ServerInfo, json.loads(content))
+        nanos, content = record
+        if isinstance(content, ServerInfo):
+            server = content
         elif server is not None:  # a recording names the server before its samples
-            sample = frame_of(content) if kind == "frame" else Truth(**content)
-            yield Record(seconds=nanos / 1e9, server=server, sample=sample)
+            yield Record(seconds=nanos / 1e9, server=server, sample=content)

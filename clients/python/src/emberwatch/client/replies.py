@@ -1,19 +1,11 @@
-"""Replies to JSON requests (PROTOCOL.md sections 6 and 13)."""
+"""Replies to requests (PROTOCOL.md section 6), which the native module makes."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, NamedTuple, TypeVar, cast, get_origin, get_type_hints
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from emberwatch.client.wire import Shape
-from emberwatch.errors import bad_answer, invalid, repr_of
 from emberwatch.model import Description
 from emberwatch.model.airspace import Airspace
-
-_Record = TypeVar("_Record")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,27 +127,6 @@ class ServerStatus:
     worlds: tuple[WorldStatus, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Grant:
-    """The reply to `acquire`, without its worlds."""
-
-    lease: int
-    ttl_millis: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LeftBeliefInfo:
-    """The reply to `belief`."""
-
-    kind: str
-    seed: int
-    episode: int
-    step: int
-    length: int
-    offset: int
-    data: str
-
-
 class LeftBelief(NamedTuple):
     """A belief that an agent left for the next agent of its world."""
 
@@ -166,79 +137,3 @@ class LeftBelief(NamedTuple):
     #: The step k that the belief is about, which is the world's current step.
     step: int
     data: bytes
-
-
-def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
-    """Parses the records of a reply's `worlds`."""
-    worlds = reply.get("worlds")
-    if not isinstance(worlds, list):
-        raise bad_answer("reply", "a list 'worlds'", repr_of(worlds))
-    return tuple(record(kind, world) for world in cast("list[Any]", worlds))
-
-
-def record(kind: type[_Record], keys: Any) -> _Record:
-    """Parses a record of a reply. Keys that this release does not know are ignored."""
-    if not isinstance(keys, Mapping):
-        raise bad_answer("reply", "an object", repr_of(keys))
-    given = cast("Mapping[str, Any]", keys)
-    values: dict[str, Any] = {}
-    for name, types in _types(kind).items():
-        if name == "airspace":
-            continue
-        if name in ("pid_namespace", "task", "worlds_fingerprint") and name not in given:
-            continue
-        if name == "recorded_world":  # may also be missing
-            nested = given.get(name)
-            values[name] = None if nested is None else record(RecordedWorld, nested)
-            continue
-        if name not in given:
-            raise bad_answer("reply", f"a key {name!r}", sorted(given))
-        value = _as_tuples(given[name])
-        if not isinstance(value, types):
-            raise bad_answer("reply", f"another {name!r}", repr_of(value))
-        values[name] = value
-    if kind is ServerInfo:
-        shape = values["height"], values["width"]
-        values["airspace"] = _airspace(given.get("airspace"), shape)
-    return kind(**values)
-
-
-def _airspace(given: Any, shape: tuple[int, int]) -> Airspace:
-    """Parses the airspace of the answer to `hello`, which may be missing."""
-    if given is None:
-        return Airspace()
-    try:
-        rows = given.get("no_fly")
-        no_fly = None if rows is None else _no_fly(rows, shape)
-        return Airspace(radius=given["radius"], no_fly=no_fly)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise bad_answer("reply", "an 'airspace' of the grid", error) from None
-
-
-def _no_fly(rows: Any, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Parses the no-fly map of the grid from its rows of 0 and 1."""
-    try:
-        cells = np.array(rows)
-    except ValueError:  # rows differ in length
-        cells = np.empty(0)
-    if cells.shape != shape or cells.dtype.kind != "i" or not np.isin(cells, (0, 1)).all():
-        raise invalid("no_fly", f"0 and 1 of shape {shape}", repr_of(rows))
-    return cells != 0
-
-
-def _as_tuples(value: Any) -> Any:
-    """Converts lists, and the lists in them, to tuples."""
-    return tuple(map(_as_tuples, cast("list[Any]", value))) if isinstance(value, list) else value
-
-
-@cache
-def _types(kind: type[Any]) -> dict[str, Any]:
-    """Returns the accepted type of each field of a record.
-
-    A tuple may contain values of any type, and a float field accepts any number.
-    """
-    wider = {float: int | float}
-    return {
-        name: tuple if get_origin(hint) is tuple else wider.get(hint, hint)
-        for name, hint in get_type_hints(kind).items()
-    }

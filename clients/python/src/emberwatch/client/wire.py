@@ -1,23 +1,13 @@
-"""Names and types of PROTOCOL.md: codes, limits, results and answers."""
+"""Names and types of PROTOCOL.md: limits and results."""
 
 import struct
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from emberwatch._native import Answer
+from emberwatch._native import StepAnswer as StepAnswer
 from emberwatch.common.codes import N_MOVES as N_MOVES
 from emberwatch.common.codes import UNOBSERVED as UNOBSERVED
-
-#: Operations of the service `step`.
-STEP: Final = 1
-OBSERVE: Final = 2
-RECALL: Final = 3
-
-#: Flags of a request: observe every cell; answer with one frame for each world's team.
-FULL_COVERAGE: Final = 1
-TEAM_FRAMES: Final = 2
 
 #: Maximum number of samples by which a reader of hidden states can lag behind.
 TRUTH_BUFFER: Final = 128
@@ -119,56 +109,3 @@ class Shape(NamedTuple):
         """Returns the number of worlds that the given consecutive robots are in."""
         last_robot = first_robot + n_robots - 1
         return last_robot // self.n_robots - first_robot // self.n_robots + 1
-
-
-class StepAnswer:
-    """The answer to a step or an observation: results and frames of consecutive robots.
-
-    Attributes:
-        first_robot: The number of the first robot; robot r of world w has number w R + r.
-        simulation_nanos: Nanoseconds that the simulation took.
-        frames: The frame of each robot, `(n_robots, H, W)`: observed values, 255 in unobserved
-            cells. If team frames were requested: the frame of each world's team,
-            `(n_worlds, H, W)`. The array is a copy that you may write to.
-    """
-
-    __slots__ = ("first_robot", "frames", "native", "simulation_nanos")
-
-    def __init__(self, native: Answer) -> None:
-        """Wraps an answer of the native module."""
-        self.native: Final = native
-        self.first_robot, self.simulation_nanos = native.first_robot, native.simulation_nanos
-        self.frames = native.frames
-
-    @property
-    def worlds(self) -> NDArray[np.void]:
-        """One `WorldResult` for each world, `(n_worlds,)` of `WORLD_DTYPE`."""
-        return self.native.worlds.view(WORLD_DTYPE)
-
-    @property
-    def robots(self) -> NDArray[np.void]:
-        """One `RobotResult` for each robot, `(n_robots,)` of `ROBOT_DTYPE`."""
-        return self.native.robots.view(ROBOT_DTYPE)
-
-    def __repr__(self) -> str:
-        others = len(self.robots) - 1
-        more = f", and {others} more" if others else ""
-        return (
-            f"StepAnswer(first_robot={self.first_robot}, simulation_nanos={self.simulation_nanos}, "
-            f"frames=<uint8 {self.frames.shape}>, results=[{self.result()}{more}])"
-        )
-
-    @property
-    def world_of(self) -> NDArray[np.int64]:
-        """The index in `worlds` of each robot's world, `(n_robots,)`."""
-        return self.native.world_of_robots
-
-    @property
-    def results(self) -> NDArray[np.void]:
-        """One `StepResult` for each robot, `(n_robots,)` of `RESULT_DTYPE`; a new array."""
-        return self.native.results.view(RESULT_DTYPE)
-
-    def result(self, index: int = 0) -> StepResult:
-        """Returns the results of one robot and its world; `index` 0 is the first robot."""
-        world, robot = self.native.result(index)
-        return StepResult(WorldResult(*world), RobotResult(*robot))

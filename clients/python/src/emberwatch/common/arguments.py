@@ -81,14 +81,14 @@ def as_flag(value: object, subject: str) -> bool:
 
 def as_seeds(
     seeds: Iterable[int | None] | None, worlds: Iterable[int]
-) -> list[dict[str, int | None]]:
-    """Checks the seeds of a reset, one for each world; returns the entries for its request."""
+) -> list[tuple[int, int | None]]:
+    """Checks the seeds of a reset, one for each world; returns worlds and seeds."""
     chosen = list(worlds)
     given = [None] * len(chosen) if seeds is None else as_list(seeds, "seeds")
     if len(given) != len(chosen):
         raise invalid("seeds", len(chosen), len(given))
     return [
-        {"world": world, "seed": None if seed is None else as_seed(seed)}
+        (world, None if seed is None else as_seed(seed))
         for world, seed in zip(chosen, given, strict=True)
     ]
 

@@ -189,12 +189,12 @@ class WildfireMovesEnv(WorldEnv):
         if self.render_mode is not None:
             self._trace(answer, path[0])
         observation, info = self._seen(answer)
-        reward, terminated, truncated, *_ = answer.native.numbers(self._pays)
+        reward, terminated, truncated, *_ = answer.numbers(self._pays)
         return observation, reward - before, terminated, truncated, info
 
     def _begin_path(self, answer: StepAnswer) -> None:
         self._answer = answer
-        _, _, _, self._step, self._n_visited, self._start = answer.native.numbers(self._pays)
+        _, _, _, self._step, self._n_visited, self._start = answer.numbers(self._pays)
         self._seen_teams = self._teams(self._observations, answer)
         states = self._session.truth(answer) if self._session.settings.truth else None
         self._flights.start_paths(ONE_ROW, self._start, states)

@@ -120,7 +120,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
             if self.render_mode is not None:
                 self._trace(answer, path[0])
             observation, info = self._seen(answer)
-            reward, terminated, truncated, *_ = answer.native.numbers(1)
+            reward, terminated, truncated, *_ = answer.numbers(1)
             self._session.finish()
         return observation, reward, terminated, truncated, info
 
@@ -130,7 +130,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     def _seen(self, answer: StepAnswer) -> tuple[NDArray[np.float32], dict[str, Any]]:
         self._answer = answer
-        _, _, _, step, n_visited, _ = answer.native.numbers(1)
+        _, _, _, step, n_visited, _ = answer.numbers(1)
         info = self._describe(answer, step, n_visited)
         if self.render_mode == "human":
             self._draw()

@@ -6,7 +6,7 @@ from typing import Any
 
 from gymnasium.envs.registration import EnvSpec
 
-from emberwatch.client.lease import Lease
+from emberwatch.client.client import Lease
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_json
 from emberwatch.common.paths import with_absolute_paths

@@ -182,7 +182,7 @@ class WildfireEnv(WorldEnv):
             self._answer = answer
             if not self.continues:
                 self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
-            _, _, _, step, n_visited, cells = answer.native.numbers(self._pays)
+            _, _, _, step, n_visited, cells = answer.numbers(self._pays)
             seen = self._seen(answer, step, n_visited, cells)
             self._session.finish()
         return seen
@@ -207,9 +207,7 @@ class WildfireEnv(WorldEnv):
             session.begin_step()
             self._answer = answer = session.step(action)
             self._update(self._observations, answer)
-            reward, terminated, truncated, step, n_visited, cells = answer.native.numbers(
-                self._pays
-            )
+            reward, terminated, truncated, step, n_visited, cells = answer.numbers(self._pays)
             if self.render_mode is not None:
                 self._trace(answer, as_moves(action, 1, self._spec.n_moves).reshape(-1))
             observation, info = self._seen(answer, step, n_visited, cells)

@@ -9,7 +9,6 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -17,10 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from emberwatch._native import CheckedSettings
 from emberwatch.client import wire
-from emberwatch.client.client import Client, connect, embed_settings
-from emberwatch.client.connection import RESET_TIMEOUT
-from emberwatch.client.lease import Lease
-from emberwatch.client.observer import Newest, Present, Truth, TruthReader
+from emberwatch.client.client import RESET_TIMEOUT, Client, Lease, connect
+from emberwatch.client.observer import Newest, Present
 from emberwatch.client.replies import LeftBelief
 from emberwatch.client.wire import StepAnswer, WorldResult
 from emberwatch.envs.advice import (
@@ -92,7 +89,7 @@ class Session:
         self._lease: Lease | None = None
         #: The settings of worlds in this process, with the files that they name.
         self._own: CheckedSettings | None = None
-        self._truth: Newest[Truth] | Present | None = None
+        self._truth: Newest | Present | None = None
         self._has_warned = False
         self._has_warned_of_gap = False
         self._state = State.CLOSED
@@ -109,7 +106,6 @@ class Session:
             with self._connect(settings.instance) as client:
                 self.spec, self._robots = running_spec(settings, n_rows, client.info)
         self.n_rows: Final = len(self._robots)
-        self._first = self._robots.start
         n_worlds = self.spec.shape.n_worlds(self._robots.start, self.n_rows)
         self.n_worlds: Final = n_worlds
         self._worlds: Final = range(settings.world, settings.world + n_worlds)
@@ -214,12 +210,11 @@ class Session:
         the world's current results.
         """
         lease = self._opened()
-        first, n_robots = self._first, self.n_rows
-        if rows is not None:
-            first, n_robots = first + rows.start, len(rows)
+        robots = None if rows is None else self._robots[rows.start : rows.stop]
+        accepts_late, timeout = self._accepts_late, self.settings.timeout
         try:
-            answer, self.n_skipped = lease.fly_from(
-                paths, first, n_robots, self._accepts_late, self.settings.timeout
+            answer, self.n_skipped = lease.fly(
+                paths, robots=robots, accepts_late=accepts_late, timeout=timeout
             )
         except LOST as error:
             raise self._lost(error) from None
@@ -313,13 +308,13 @@ class Session:
         try:
             if settings.instance is None:
                 assert self._own is not None
-                self._client = client = embed_settings(self._own, seed)
+                self._client = client = Client.embedded(self._own, seed)
                 self._truth = Present(client.truths) if settings.truth else None
             else:
                 self._client = client = self._connect(settings.instance)
                 self._check_unchanged(client)
                 if settings.truth:
-                    self._truth = Newest(partial(TruthReader, client.instance), self._worlds)
+                    self._truth = Newest(client.instance, self._worlds)
             self._lease = self._acquire(client, settings.takeover)  # sets `is_open`
             self._state = State.MOVED
         except BaseException:

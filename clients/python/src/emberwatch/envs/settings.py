@@ -15,7 +15,7 @@ from typing import Any, Final, TypedDict, TypeVar, cast, get_args, get_type_hint
 import numpy as np
 
 import emberwatch._native as _native
-from emberwatch.client.connection import STEP_TIMEOUT
+from emberwatch.client.client import STEP_TIMEOUT
 from emberwatch.client.replies import ServerInfo
 from emberwatch.client.wire import Shape
 from emberwatch.common.arguments import as_count, read_settings

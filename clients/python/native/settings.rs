@@ -1,23 +1,19 @@
-//! The worlds behind a connection: either a server's worlds, or worlds in this process.
+//! Settings of worlds in this process, and the texts of models.
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::model::shape_of;
 use crate::refusal::{failed, refused};
-use crate::wire::Connection;
-use emberwatch_messages::backend::Backend;
-use emberwatch_messages::limits::threads::spawn;
 use emberwatch_model::Model;
 use emberwatch_model::hazards::Hazards;
-use emberwatch_model::settings::{SettingError, Settings as _, WorldSettings};
-use emberwatch_sim::config::{Checked, ServerConfig, model_named};
-use emberwatch_sim::embedded::{Embedded, wait_for};
+use emberwatch_model::settings::{Settings as _, WorldSettings};
+use emberwatch_sim::config::{Checked, model_named};
+use emberwatch_sim::embedded::Embedded;
+use emberwatch_sim::embedded::settings::{self, LONGEST_READ, ReadError};
 use emberwatch_sim::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 use std::ops::Range;
-use std::sync::mpsc::channel;
-use std::time::{Duration, Instant};
 
 /// Settings of worlds in this process, with the files that they name, which are read only here.
 #[pyclass(frozen, module = "emberwatch._native")]
@@ -155,7 +151,8 @@ pub fn model_text(py: Python<'_>, name: String) -> PyResult<String> {
     if let Some((_, text)) = Model::built_in_files().find(|(known, _)| *known == name) {
         return Ok(text.into());
     }
-    let model = py.detach(|| settings::in_time(settings::may_block(&name), || model_named(&name)));
+    let may_block = settings::may_block(&name);
+    let model = py.detach(|| settings::in_time(may_block, move || model_named(&name)));
     let model = model.map_err(|problem| unread(py, problem))?;
     let model = model.map_err(|problem| refused(py, problem))?;
     let no_fly = model.file().no_fly.as_ref().and_then(|map| map.grid().ok());

@@ -1,0 +1,12 @@
+"""The stub of the native module tells the truth: names, parameters and defaults are the module's."""
+
+import subprocess
+import sys
+
+
+def test_the_stub_is_that_of_the_module() -> None:
+    # `__all__` and the helpers of pickle are for the machine alone.
+    allowed = "emberwatch._native.(__all__|read_again|.*.__deepcopy__|.*.__getnewargs__)"
+    command = [sys.executable, "-m", "mypy.stubtest", "emberwatch._native", "--concise"]
+    given = subprocess.run([*command, "--allowlist", "/dev/stdin", "--ignore-unused-allowlist"], input=allowed, text=True, capture_output=True)
+    assert given.returncode == 0, given.stdout
