@@ -1,4 +1,4 @@
-"""Writes the pages of the documentation site to a folder: `site.py FOLDER`.
+"""Writes the pages of the documentation site, and the Python package that they describe: `site.py PAGES PACKAGE`.
 
 The pages are made from `docs` and the repository's other documents, so that no text exists twice. Links are rewritten
 for the site, and a notebook becomes a page.
@@ -6,6 +6,7 @@ for the site, and a notebook becomes a page.
 
 from __future__ import annotations
 
+import ast
 import html
 import json
 import posixpath
@@ -118,9 +119,31 @@ def shown(output: dict[str, Any]) -> str:
     return f"<pre><code>{html.escape(''.join(result['text/plain']))}</code></pre>"
 
 
+def document_native(stub: Path) -> None:
+    """Adds the docstrings of the compiled module to its stub, which holds only types."""
+    from emberwatch import _native
+
+    def add(nodes: list[ast.stmt], owner: object) -> None:
+        for node in nodes:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef):
+                given = getattr(owner, node.name.replace("_Reader", "Observer"), None)
+                if isinstance(node, ast.ClassDef):
+                    add(node.body, given)
+                if given is not None and given.__doc__:
+                    node.body.insert(0, ast.Expr(ast.Constant(given.__doc__)))
+
+    tree = ast.parse(stub.read_text("utf-8"))
+    add(tree.body, _native)
+    stub.write_text(ast.unparse(ast.fix_missing_locations(tree)), "utf-8")
+
+
 def main() -> None:
-    """Writes all pages."""
-    out, found = Path(sys.argv[1]), pages()
+    """Writes all pages and the package."""
+    out, package, found = Path(sys.argv[1]), Path(sys.argv[2]), pages()
+    shutil.rmtree(package, ignore_errors=True)
+    source = ROOT / "clients/python/src/emberwatch"
+    shutil.copytree(source, package / "emberwatch", ignore=shutil.ignore_patterns("*.so"))
+    document_native(package / "emberwatch/_native.pyi")
     shutil.rmtree(out, ignore_errors=True)
     for source, page in found.items():
         path, place = ROOT / source, out / page
