@@ -80,7 +80,7 @@ def test_numbers_out_of_range_are_refused() -> None:
 
 
 def test_other_threads_run_during_work_on_large_grids() -> None:
-    prior = uniform_prior(WILDFIRE, height=600, width=600)
+    prior = uniform_prior(WILDFIRE, height=200, width=200)
     kept = known(WILDFIRE, prior=prior, n_worlds=2)
     frames = np.zeros(kept.shape, np.uint8)
     for work in (kept.predict, partial(kept.correct, frames)):

@@ -5,7 +5,11 @@
 pub mod settings;
 #[cfg(test)]
 mod tests;
+mod waiting;
 
+pub use waiting::INSTANCE;
+
+use self::waiting::wait_for;
 use crate::config::Checked;
 use crate::limits::{check_memory, n_threads, start};
 use crate::rate::Rate;
@@ -18,7 +22,6 @@ use anyhow::Result;
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::{Reply, ServerInfo};
 use emberwatch_messages::errors::{ConnectionError, check_status};
-use emberwatch_messages::interrupt::check_interrupt;
 use emberwatch_messages::limits::threads::NoThreads;
 use emberwatch_messages::message::{Status, StepRequest, VERSION, WorldResult};
 use emberwatch_model::grid::Grid;
@@ -26,17 +29,11 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
-
-/// The instance name that errors show. It is not a valid name for a server.
-pub const INSTANCE: &str = "(embedded)";
 
 /// Maximum number of queued file jobs. Each job keeps a whole snapshot in memory.
 const MAX_FILES: usize = 16;
-
-/// How often a waiting call checks for an interrupt.
-const INTERVAL: Duration = Duration::from_millis(5);
 
 /// The index of a world and its episode after a reset.
 type Reset = (usize, Box<Episode>);
@@ -331,32 +328,6 @@ impl Drop for Embedded {
     /// Stops burn-ins that are still running.
     fn drop(&mut self) {
         self.rules.ended.store(true, Ordering::Relaxed);
-    }
-}
-
-/// Receives a value from another thread, for at most `timeout` after `start`.
-///
-/// # Errors
-/// [`ConnectionError::Timeout`] if the time is over or the sender was dropped, or the error of the interrupt.
-pub fn wait_for<T>(
-    receiver: &Receiver<T>,
-    start: Instant,
-    timeout: Duration,
-) -> Result<T, ConnectionError> {
-    loop {
-        let left = timeout.saturating_sub(start.elapsed());
-        match receiver.recv_timeout(left.min(INTERVAL)) {
-            Ok(next) => return Ok(next),
-            Err(RecvTimeoutError::Timeout) if !left.is_zero() => check_interrupt()?,
-            // The timeout has passed, or the job panicked before it sent a value.
-            Err(_) => {
-                return Err(ConnectionError::Timeout {
-                    what: "a control request",
-                    instance: INSTANCE.into(),
-                    timeout,
-                });
-            }
-        }
     }
 }
 
