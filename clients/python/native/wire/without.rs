@@ -20,7 +20,12 @@ pub struct Connection(Infallible);
 
 impl Connection {
     /// Refuses to connect.
-    pub fn open(instance: &Instance, _: &str, _: Duration) -> Result<Self, ConnectionError> {
+    pub fn open_within(
+        instance: &Instance,
+        _: &str,
+        _: (Duration, Duration),
+        _: impl FnMut(&ConnectionError) -> bool,
+    ) -> Result<Self, ConnectionError> {
         Err(refusal(instance).into())
     }
 }
@@ -69,7 +74,11 @@ impl Observer<AgentHeader> {
 }
 
 impl<H> Observer<H> {
-    pub fn receive(&self, _: Duration) -> Result<Option<Sample<H>>, ChannelError> {
+    pub fn next_of(
+        &self,
+        _: Option<u32>,
+        _: Duration,
+    ) -> Result<Option<(Sample<H>, u64)>, ConnectionError> {
         match self.0 {}
     }
 }
