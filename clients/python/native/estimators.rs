@@ -13,11 +13,13 @@ use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
 use emberwatch_belief::estimation::scoring::score;
 use emberwatch_learning::file::replace_file;
-use emberwatch_model::frame::FrameError;
 use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_model::text::shortened;
 use emberwatch_model::{Frame, Grid, Model, Shape};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
-use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
+use numpy::{
+    Element, IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3,
+};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 use std::any::Any;
@@ -163,16 +165,9 @@ impl Estimators {
             let got = format!("'{}', which predicts observations", self.kind);
             return Err(invalid(py, "sample", "a belief about states", got));
         }
-        let mut state = self.state(py)?;
-        let worlds = &mut state.worlds;
-        let (height, width) = self.shape.dim();
-        let mut out = Array3::zeros((worlds.len(), height, width));
-        let tasks = worlds.iter_mut().zip(out.outer_iter_mut()).enumerate();
-        self.each(py, false, tasks, |(index, (world, mut out))| {
-            let mut rng = stream(seed, Purpose::Sample, index as u64);
-            out.assign(&world.belief().sample(&mut rng));
-        })?;
-        Ok(out.into_pyarray(py))
+        self.of_cells(py, false, |index, belief| {
+            belief.sample(&mut stream(seed, Purpose::Sample, index as u64))
+        })
     }
 
     /// Returns the number of worlds, the height and the width.
@@ -196,15 +191,7 @@ impl Estimators {
 
     /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
-        let mut state = self.state(py)?;
-        let worlds = &mut state.worlds;
-        let (height, width) = self.shape.dim();
-        let mut out = Array3::zeros((worlds.len(), height, width));
-        let tasks = worlds.iter_mut().zip(out.outer_iter_mut());
-        self.each(py, true, tasks, |(world, mut out)| {
-            out.assign(&world.belief().entropy(EntropyKind::Sum));
-        })?;
-        Ok(out.into_pyarray(py))
+        self.of_cells(py, true, |_, belief| belief.entropy(EntropyKind::Sum))
     }
 
     /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep the correlations
@@ -445,6 +432,28 @@ impl Estimators {
         done.ok_or_else(raised)
     }
 
+    /// Computes an array `[n, H, W]` from the belief about each world.
+    fn of_cells<'py, T: Element + Copy + Default + Send>(
+        &self,
+        py: Python<'py>,
+        is_cheap: bool,
+        work: impl Fn(usize, &Belief) -> Grid<T> + Sync + Send,
+    ) -> PyResult<Bound<'py, PyArray3<T>>> {
+        let mut state = self.state(py)?;
+        let (height, width) = self.shape.dim();
+        let mut out = Array3::default((self.n_worlds, height, width));
+        let tasks = state.worlds.iter_mut().zip(out.outer_iter_mut());
+        self.each(
+            py,
+            is_cheap,
+            tasks.enumerate(),
+            |(index, (world, mut out))| {
+                out.assign(&work(index, world.belief()));
+            },
+        )?;
+        Ok(out.into_pyarray(py))
+    }
+
     /// Returns the number of probabilities in the belief about one world.
     fn n_numbers(&self) -> usize {
         self.state_names.len() * self.shape.n_cells()
@@ -490,23 +499,9 @@ impl Estimators {
         let frame = |(frame, &chosen): (numpy::ndarray::ArrayView2<'_, u8>, &bool)| {
             let bytes = frame.to_slice().expect("invariant: row-major");
             let frame = chosen.then(|| Frame::from_bytes(self.shape, self.n_observations, bytes));
-            frame.transpose().map_err(|error| self.no_frame(py, &error))
+            frame.transpose().map_err(|error| refused(py, error))
         };
         worlds.map(frame).collect()
-    }
-
-    fn no_frame(&self, py: Python<'_>, error: &FrameError) -> PyErr {
-        let FrameError::Value {
-            index,
-            value,
-            n_observations,
-        } = error
-        else {
-            return refused(py, error);
-        };
-        let subject = format!("frame: cell {}", self.shape.cell(*index));
-        let expected = format!("a value below {n_observations}, or 255");
-        invalid(py, subject, expected, value)
     }
 }
 
@@ -516,16 +511,11 @@ fn forget(steps: &mut [Option<u64>], chosen: &[bool]) {
     steps.filter(|it| *it.1).for_each(|(step, _)| *step = None);
 }
 
-/// Names worlds for an error: all, or the first eight and how many more.
+/// Names worlds for an error; of many, the first and the last.
 fn named(worlds: &[usize]) -> String {
-    let (shown, more) = worlds.split_at(worlds.len().min(8));
-    let numbers: Vec<String> = shown.iter().map(usize::to_string).collect();
+    let numbers: Vec<String> = worlds.iter().map(usize::to_string).collect();
     let plural = if worlds.len() > 1 { "s" } else { "" };
-    let more = match more.len() {
-        0 => String::new(),
-        n => format!(" and {n} more"),
-    };
-    format!("world{plural} {}{more}", numbers.join(", "))
+    format!("world{plural} {}", shortened(&numbers.join(", ")))
 }
 
 /// Creates the exception for a belief that could not be built, or could not be corrected with a frame.
