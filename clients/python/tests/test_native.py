@@ -81,9 +81,6 @@ def test_numbers_out_of_range_are_refused() -> None:
             simulated_prior(WILDFIRE, **right | wrong)
     with refuses("grid: expected height and width within 1 to 4096, got 4097 x 3"):
         known(WILDFIRE, prior=uniform_prior(WILDFIRE, height=4097, width=3))
-    values, robots = np.zeros((1, 2, 2), np.float32), np.zeros((1, 2), int)
-    with refuses("n_moves: expected an integer within 1 to 4096, got 4097"):
-        _native.beam_search(values, robots, np.zeros(1, np.uint64), 4097, 1)
 
 
 def test_other_threads_run_during_work_on_large_grids() -> None:

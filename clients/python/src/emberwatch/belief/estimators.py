@@ -6,14 +6,13 @@
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar, cast
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.belief.prior import distribution
-from emberwatch.common.arguments import as_array, as_count, as_flag, as_integer
+from emberwatch.common.arguments import as_array, as_count, as_flag
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
@@ -73,7 +72,12 @@ def known(
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
     model = Model.named(model)
-    numbers = distribution(prior, n_states=model.n_states).astype(np.float32)
+    expected = f"numbers of shape ({model.n_states}, H, W)"
+    given = as_array(prior, "prior", expected)
+    if given.ndim != 3 or len(given) != model.n_states or given.dtype.kind not in "fiu":
+        raise invalid("prior", expected, f"{given.dtype} of shape {given.shape}")
+    with np.errstate(over="ignore"):  # infinity is refused
+        numbers = given.astype(np.float32, order="C")
     return Belief(_native.Estimators.known(model.toml, numbers, kind, _n_worlds(n_worlds)))
 
 
@@ -291,7 +295,10 @@ class Belief:
         shape (n_worlds,). `states` has the shape and type of frames, and values below S. `target`
         is the value in `states` of the state that pays most; None: `target_state`.
         """
-        figures = self._native.scores(self._frames(states, "states"), target_of(self, target))
+        if target is None:
+            target = self.target_state
+        target = as_count(target, "target", 0, len(self.state_names) - 1)
+        figures = self._native.scores(self._frames(states, "states"), target)
         losses, briers, accuracies = (self._of_worlds(figure) for figure in figures)
         return losses, briers, accuracies
 
@@ -317,35 +324,16 @@ class Belief:
     def _chosen(self, worlds: ArrayLike | slice | None) -> NDArray[np.bool_]:
         """Returns the mask of the chosen worlds."""
         chosen = np.zeros(self._shape[0], np.bool_)
-        expected = (
-            f"a mask of {len(chosen)} worlds, indices from 0 to {len(chosen) - 1}, or a slice"
-        )
-        index = slice(None) if worlds is None else worlds
-        if not isinstance(index, slice):
-            index = as_array(index, "worlds", expected)
-            is_mask = index.dtype == np.bool_
-            if not index.size and not is_mask:
-                index = index.astype(np.intp)  # NumPy reads [] as float64
-            if index.ndim > 1 or (is_mask and index.shape != chosen.shape):
-                raise invalid("worlds", expected, repr_of(worlds))
         try:
-            chosen[index] = True
+            chosen[slice(None) if worlds is None else cast("Any", worlds)] = True
         except (IndexError, TypeError, ValueError):
+            n = len(chosen)
+            expected = f"a mask of {n} worlds, indices from 0 to {n - 1}, or a slice"
             raise invalid("worlds", expected, repr_of(worlds)) from None
         return chosen
 
     def _of_worlds(self, values: NDArray[_Number]) -> NDArray[_Number]:
         return values[0] if self._is_single else values
-
-
-def target_of(belief: Belief, target: int | None) -> int:
-    """Checks the index of a target state; None stands for the belief's `target_state`."""
-    names = belief.state_names
-    number = belief.target_state if target is None else as_integer(target)
-    if number is not None and not isinstance(target, bool) and 0 <= number < len(names):
-        return number
-    expected = f"an integer within 0 to {len(names) - 1} ({', '.join(names)})"
-    raise invalid("target", expected, repr_of(target))
 
 
 def _n_worlds(n_worlds: int | None) -> int | None:
