@@ -514,7 +514,7 @@ class Estimators:
     @staticmethod
     def from_bytes(bytes: bytes) -> Estimators: ...
     def save(self, file: str) -> None: ...
-    def steps(self) -> list[int | None]:
+    def steps(self) -> list[int] | None:
         """Returns the number of predictions of each world; None after an interrupted call."""
 
     def sample(self, seed: int) -> NDArray[np.uint8]:

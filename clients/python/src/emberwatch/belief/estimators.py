@@ -145,9 +145,9 @@ class Belief:
     - `copy.copy`, `copy.deepcopy` and `pickle` make independent copies, as `copy` does. A pickle
       has everything that the belief needs: the model or the checkpoint, the first belief, and the
       state. An autoencoder's belief cannot be copied or saved: `InvalidArgumentError`.
-    - Signals such as Ctrl-C end every call about many worlds, between two worlds. The worlds of an
-      unfinished `correct` or `predict` then refuse all calls with an `EmberwatchError`, code
-      ``"interrupted"``, until `reset`.
+    - Signals such as Ctrl-C end every call about many worlds, between two worlds. After an
+      unfinished `correct` or `predict`, the belief refuses all calls with an `EmberwatchError`,
+      code ``"interrupted"``, until a `reset` of all worlds.
 
     Only one thread at a time may use a belief.
     """
@@ -159,10 +159,9 @@ class Belief:
 
     def __repr__(self) -> str:
         """Shows kind, shape, worlds and step: the number of predictions since the first belief."""
-        steps = set(self._native.steps())
-        known_steps = sorted(step for step in steps if step is not None)
-        ends = dict.fromkeys([*known_steps[:1], *known_steps[-1:]])
-        step = "unfinished" if None in steps else " to ".join(map(str, ends))
+        steps = self._native.steps()
+        ends = None if steps is None else dict.fromkeys((min(steps), max(steps)))
+        step = "unfinished" if ends is None else " to ".join(map(str, ends))
         return f"Belief({self.kind!r}, shape={self.shape}, worlds={self._shape[0]}, step={step})"
 
     def __copy__(self) -> "Belief":
