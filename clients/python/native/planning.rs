@@ -20,8 +20,8 @@ const MAX_BYTES: usize = 1 << 32;
 /// Interval at which a search checks for Ctrl-C.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// Plans a path for each world. `values`, `[n, H, W]`, are finite; `robots`, `[n, 2]`, are cells of the grid; `keys`,
-/// `[n]`, break ties. Python has checked that `n_moves` and `width` are in range.
+/// Plans a path for each world. `values`, `[n, H, W]`, are finite; `robots` has shape `[n, 2]`; `keys`, `[n]`, break
+/// ties. Python has checked that `n_moves` and `width` are in range.
 #[pyfunction]
 #[pyo3(signature = (values, robots, keys, n_moves, width, airspace=None))]
 pub fn beam_search<'py>(
@@ -61,6 +61,10 @@ pub fn beam_search<'py>(
             row: robot[0] as usize,
             col: robot[1] as usize,
         };
+        if !shape.contains(start) || !airspace.is_free(start) {
+            let expected = format!("cells of a {shape} grid where they may fly");
+            return Err(invalid(py, "robots", expected, robot));
+        }
         let problem = PlanningProblem {
             start,
             n_moves,
