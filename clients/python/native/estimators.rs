@@ -3,7 +3,7 @@
 use crate::detached::detached;
 use crate::errors::{check_memory, raised};
 use crate::model::shape_of;
-use crate::origin::{Origin, checkpoint_bytes, kind_of, no_prior, unfit};
+use crate::origin::{Origin, checkpoint_bytes, kind_of, unfit};
 use crate::refusal::{failed, invalid, refused};
 use crate::saved::{Saved, is_saved};
 use crate::threads::Pool;
@@ -87,7 +87,7 @@ impl Estimators {
         let (_, height, width) = prior.as_array().dim();
         shape_of(py, height, width)?;
         let prior = Belief::from_probabilities(prior.as_array().to_owned());
-        let prior = prior.map_err(|error| no_prior(py, error))?;
+        let prior = prior.map_err(|error| refused(py, format!("prior: {error}")))?;
         Self::new(py, Origin::known(py, model, prior, kind)?.into(), n_worlds)
     }
 

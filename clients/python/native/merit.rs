@@ -1,6 +1,5 @@
 //! Figures of merit of runs on several worlds.
 
-use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_belief::merit::{self, Found};
@@ -32,12 +31,6 @@ impl MeritTally {
         target: u8,
     ) -> PyResult<Self> {
         let shape = shape_of(py, height, width)?;
-        let n_bytes = n_worlds.saturating_mul(size_of::<u32>() * shape.n_cells());
-        check_memory(
-            py,
-            format_args!("the figures of merit of {n_worlds} worlds"),
-            n_bytes,
-        )?;
         let tally = merit::MeritTally::new(shape, target);
         Ok(Self {
             shape,

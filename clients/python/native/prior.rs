@@ -2,10 +2,10 @@
 
 use crate::errors::{check_memory, no_threads, raised};
 use crate::model::{model_of, shape_of};
-use crate::refusal::invalid;
+use crate::refusal::refused;
 use crate::threads::watched;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
-use emberwatch_model::{Model, ModelError, Shape};
+use emberwatch_model::{Model, Shape};
 use numpy::{PyArray3, ToPyArray};
 use pyo3::prelude::*;
 use rayon::ThreadPoolBuilder;
@@ -57,24 +57,6 @@ fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyRes
         })
     });
     let belief = made.ok_or_else(raised)?;
-    let belief = belief.map_err(|error| vanishing(py, &error))?;
+    let belief = belief.map_err(|error| refused(py, error))?;
     Ok(belief.expect("invariant: `watched` alone cancels it"))
-}
-
-/// Creates the exception for a model whose transition weights can all be 0, or can lose their precision.
-pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
-    match error {
-        ModelError::ZeroWeight { cell, .. } => {
-            let subject = format!("model: transition weights of cell {cell}");
-            let got = "weights that can all be 0";
-            invalid(py, subject, "a positive sum for every neighbourhood", got)
-        }
-        ModelError::Value {
-            what,
-            expected,
-            got,
-            ..
-        } => invalid(py, format!("model: {what}"), expected, got),
-        other => invalid(py, "model", "weights that keep their precision", other),
-    }
 }

@@ -197,8 +197,8 @@ KNOWN_REFUSALS: list[tuple[dict[str, Any], str]] = [
     ({"kind": "\ud800"}, "got '\\ud800'"),
     ({"prior": "uniform"}, "prior: expected numbers of shape (3, H, W), got <U7 of shape ()"),
     ({"prior": PRIOR[:2]}, "prior: expected numbers of shape (3, H, W), got float32 of shape (2,"),
-    ({"prior": np.full((3, 1, 1), np.nan)}, "prior: cell (0, 0): expected probabilities >= 0 with"),
-    ({"prior": np.full((3, 1, 1), 1e99)}, "prior: cell (0, 0): expected probabilities >= 0 with"),
+    ({"prior": np.full((3, 1, 1), np.nan)}, "prior: belief of cell (0, 0): expected probabilities >= 0 wi"),
+    ({"prior": np.full((3, 1, 1), 1e99)}, "prior: belief of cell (0, 0): expected probabilities >= 0 wi"),
     ({"n_worlds": 0}, "n_worlds: expected an integer within 1 to 1048576, got 0"),
 ]
 
