@@ -2,6 +2,7 @@
 
 Calls that wait release the interpreter lock, and Ctrl-C interrupts them. Open objects belong to the
 process that made them: using one in a forked child raises an error with code `"forked"`.
+What has no docstring here is documented in `clients/python/native`.
 """
 
 from os import PathLike
@@ -71,17 +72,14 @@ MAX_SIDE: int
 #: Maximum number of states of a model, and maximum number of its observations.
 MAX_VALUES: int
 
-def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
-    """Returns the texts of built-in files by name; `states` are descriptions of recorded states."""
-
+def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]: ...
 def world_settings() -> dict[str, tuple[int, int] | None]:
     """Returns the range of each setting of worlds, by its name in `config/server.toml`.
 
     The range is None unless the setting is a number.
     """
 
-def explain(status: int, detail: int) -> tuple[str, str] | None:
-    """Returns the name and the message of a status code; None if the code is not a refusal."""
+def explain(status: int, detail: int) -> tuple[str, str] | None: ...
 
 @final
 class CheckedSettings:
@@ -249,45 +247,23 @@ class Options:
         checkpoint: tuple[str, bytes] | None,
         prior: str,
         watched: tuple[str, int] | None,
-    ) -> None:
-        """Checks all arguments. `checkpoint`: the path, for errors, and the bytes of the file.
-
-        `watched`: instance on which beliefs are published, and the number of world 0 there.
-        """
-
+    ) -> None: ...
     @property
-    def estimator(self) -> str:
-        """Name of the estimator that computes the beliefs."""
-
-    def start_episodes(self, worlds: list[int], seeds: list[int]) -> None:
-        """Starts episodes in `worlds` with these seeds; resets the beliefs about these worlds."""
-
-    def take_over(self, world: int, kind: str, data: bytes) -> bool:
-        """Loads another client's belief about the current step; False if it does not fit."""
-
-    def left(self, world: int) -> tuple[str, bytes] | None:
-        """Returns the kind and the bytes of a belief, for the next client."""
-
-    def see(self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]) -> None:
-        """Updates beliefs with an earlier step. `results`: as in `plan`; `frames`: `(n, H, W)`."""
-
+    def estimator(self) -> str: ...
+    def start_episodes(self, worlds: list[int], seeds: list[int]) -> None: ...
+    def take_over(self, world: int, kind: str, data: bytes) -> bool: ...
+    def left(self, world: int) -> tuple[str, bytes] | None: ...
+    def see(
+        self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]
+    ) -> None: ...
     def plan(
         self,
         worlds: list[int],
         results: NDArray[np.uint8],
         frames: NDArray[np.uint8] | None,
         flown: list[int] | None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Updates beliefs with the current step, unless `frames` is None, then plans.
-
-        `results`: bytes of `wire.RESULT_DTYPE`. `flown`: the option flown in each world.
-
-        Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
-        worlds, as new arrays.
-        """
-
-    def close(self) -> None:
-        """Drops all beliefs. May be called again."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]: ...
+    def close(self) -> None: ...
 
 class Flights:
     """The current path of each robot, up to its latest move; one row for each robot.
@@ -451,38 +427,24 @@ class Recording:
     def read(self) -> tuple[int, Literal["server", "frame", "truth"], Any] | None:
         """Returns nanoseconds, kind, and a server's JSON or a sample's fields; None at the end."""
 
-def checkpoint_bytes(path: str) -> bytes:
-    """Returns the bytes of a checkpoint; refuses folders, pipes and files that are too large."""
-
-def option_names() -> tuple[list[str], list[str]]:
-    """Returns the names of the options, and of the features that describe each plan."""
-
-def read_model(text: str) -> dict[str, Any]:
-    """Returns the fields of `Model` except `toml`; `ValueError` if the text is not a model file."""
-
+def checkpoint_bytes(path: str) -> bytes: ...
+def option_names() -> tuple[list[str], list[str]]: ...
+def read_model(text: str) -> dict[str, Any]: ...
 def model_text(name: str) -> str:
     """Returns the text of a model with all maps, by its name, path, or the text of its file."""
 
-def model_with_radius(text: str, radius: int) -> str:
-    """Returns the text of a model file with another sensor radius."""
-
-def description_with_radius(text: str, radius: int) -> str:
-    """Returns the text of a description with another sensor radius."""
-
-def read_description(text: str) -> dict[str, Any]:
-    """Returns the fields of `Description` except `toml`; `ValueError` if the text is invalid."""
+def model_with_radius(text: str, radius: int) -> str: ...
+def description_with_radius(text: str, radius: int) -> str: ...
+def read_description(text: str) -> dict[str, Any]: ...
 
 @final
 class Dynamics:
     """The transition of worlds for one model on one grid; `Model.advance` checks the arguments."""
 
-    def __new__(cls, model: str, height: int, width: int) -> Dynamics:
-        """`model`: the text of a model file."""
-
+    def __new__(cls, model: str, height: int, width: int) -> Dynamics: ...
     def advance(
         self, states: NDArray[np.uint8], seeds: NDArray[np.uint64], step: int
-    ) -> NDArray[np.uint8]:
-        """Returns the states one step later, `(n, H, W)`, as a new array; `seeds`: `(n,)`."""
+    ) -> NDArray[np.uint8]: ...
 
 class Estimators:
     """Beliefs of one kind about n worlds; `Belief` checks the arguments.
@@ -493,9 +455,7 @@ class Estimators:
     @staticmethod
     def known(
         model: str, prior: NDArray[np.float32], kind: str, n_worlds: int | None
-    ) -> Estimators:
-        """Builds beliefs from a model file's text. All worlds share the `prior`, `(S, H, W)`."""
-
+    ) -> Estimators: ...
     @staticmethod
     def load(
         file: str,
@@ -503,27 +463,16 @@ class Estimators:
         kind: str | None,
         model: str | None,
         n_worlds: int | None,
-    ) -> Estimators:
-        """Loads beliefs; `grid` is height and width, `model` a model file's text.
-
-        A file of `save` takes no other arguments.
-        """
-
+    ) -> Estimators: ...
     def copy(self) -> Estimators: ...
     def to_bytes(self) -> bytes: ...
     @staticmethod
     def from_bytes(bytes: bytes) -> Estimators: ...
     def save(self, file: str) -> None: ...
-    def steps(self) -> list[int] | None:
-        """Returns the number of predictions of each world; None after an interrupted call."""
-
-    def sample(self, seed: int) -> NDArray[np.uint8]:
-        """Returns states drawn cell by cell, as a new array, `(n, H, W)`."""
-
+    def steps(self) -> list[int] | None: ...
+    def sample(self, seed: int) -> NDArray[np.uint8]: ...
     @property
-    def is_single(self) -> bool:
-        """Whether arrays have no axis for worlds."""
-
+    def is_single(self) -> bool: ...
     @property
     def kind(self) -> str: ...
     @property
@@ -533,32 +482,19 @@ class Estimators:
     @property
     def n_observations(self) -> int: ...
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Number of worlds, height and width."""
-
-    def belief(self) -> NDArray[np.float32]:
-        """Returns the beliefs as a new array, `(S, n, H, W)`."""
-
-    def entropy(self) -> NDArray[np.float32]:
-        """Returns the entropy of each cell in nats, as a new array, `(n, H, W)`."""
-
+    def shape(self) -> tuple[int, int, int]: ...
+    def belief(self) -> NDArray[np.float32]: ...
+    def entropy(self) -> NDArray[np.float32]: ...
     def reset(self, chosen: NDArray[np.bool_], keeps_correlations: bool) -> None: ...
-    def correct(self, frames: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> None:
-        """Corrects the beliefs about the chosen worlds; one frame for each world, `(n, H, W)`."""
-
+    def correct(self, frames: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> None: ...
     def predict(self, chosen: NDArray[np.bool_]) -> None: ...
-    def scores(self, states: NDArray[np.uint8], target: int) -> tuple[_Doubles, _Doubles, _Doubles]:
-        """Returns log loss, Brier score and accuracy for states `(n, H, W)`, `(n,)` each."""
+    def scores(
+        self, states: NDArray[np.uint8], target: int
+    ) -> tuple[_Doubles, _Doubles, _Doubles]: ...
+    def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]: ...
 
-    def score_frames(self, frames: NDArray[np.uint8]) -> tuple[_Doubles, _Doubles]:
-        """Returns log-likelihoods of frames `(n, H, W)` and numbers of observed cells, `(n,)`."""
-
-def belief_kinds() -> list[tuple[str, tuple[str, bool, bool, bool]]]:
-    """Returns the name of each kind of belief that frames can correct, and the fields of `Kind`."""
-
-def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]:
-    """Returns the share of 64 simulated worlds with each cell in each state, `(S, H, W)`."""
-
+def belief_kinds() -> list[tuple[str, tuple[str, bool, bool, bool]]]: ...
+def simulated_prior(model: str, height: int, width: int, burn_in: int) -> NDArray[np.float32]: ...
 def beam_search(
     values: NDArray[np.float32],
     robots: NDArray[np.int64],
@@ -566,11 +502,7 @@ def beam_search(
     n_moves: int,
     width: int,
     airspace: _Airspace | None = None,
-) -> NDArray[np.uint8]:
-    """Returns a path for each world, `(n, n_moves)`.
-
-    `values`: `(n, H, W)`; `robots`: `(n, 2)`; `keys`: `(n,)`, seeds that break ties.
-    """
+) -> NDArray[np.uint8]: ...
 
 @final
 class MeritTally:
@@ -584,11 +516,10 @@ class MeritTally:
         n_hits: NDArray[np.uint32],
         n_burning: NDArray[np.uint32],
         states: NDArray[np.uint8] | None,
-    ) -> None:
-        """Adds a step; shapes `(n, H, W)`, `(n, R, 2)`, `(n,)`, `(n,)` and `(n, H, W)`."""
-
-    def merit(self, world: int) -> tuple[int | None, int | None, float | None, float | None, float]:
-        """Returns the fields of `Merit`."""
+    ) -> None: ...
+    def merit(
+        self, world: int
+    ) -> tuple[int | None, int | None, float | None, float | None, float]: ...
 
 def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
     """Checks that each row has one integer below `n_choices`; returns the integers as bytes.
