@@ -197,8 +197,14 @@ KNOWN_REFUSALS: list[tuple[dict[str, Any], str]] = [
     ({"kind": "\ud800"}, "got '\\ud800'"),
     ({"prior": "uniform"}, "prior: expected numbers of shape (3, H, W), got <U7 of shape ()"),
     ({"prior": PRIOR[:2]}, "prior: expected numbers of shape (3, H, W), got float32 of shape (2,"),
-    ({"prior": np.full((3, 1, 1), np.nan)}, "prior: belief of cell (0, 0): expected probabilities >= 0 wi"),
-    ({"prior": np.full((3, 1, 1), 1e99)}, "prior: belief of cell (0, 0): expected probabilities >= 0 wi"),
+    (
+        {"prior": np.full((3, 1, 1), np.nan)},
+        "prior: belief of cell (0, 0): expected probabilities >= 0 wi",
+    ),
+    (
+        {"prior": np.full((3, 1, 1), 1e99)},
+        "prior: belief of cell (0, 0): expected probabilities >= 0 wi",
+    ),
     ({"n_worlds": 0}, "n_worlds: expected an integer within 1 to 1048576, got 0"),
 ]
 
@@ -260,33 +266,14 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
     for name in ("learned_filter", "neural_belief"):
         with refuses("checkpoint: expected the world's 4 observations, got 3"):
             belief.load(checkpoints / name, **GRID, model=model)
-
-
-def test_a_neural_belief_can_use_a_known_sensor(checkpoints: Path) -> None:
-    def neural(**keywords: Any) -> Belief:
-        return belief.load(checkpoints / "neural_belief", **GRID, **keywords)
-
-    plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
-    shows = MODEL.observation_matrix.T
-    # Beliefs may differ where inverting the sensor gives a negative probability, clamped to 0.
-    possible = (noisy.belief > 1e-5).all(0)
-    shown = np.tensordot(shows, noisy.belief, 1)
-    assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)
-    before = noisy.belief[:, 3, 4]
-    frame = np.full((16, 16), 255, np.uint8)
-    frame[3, 4] = 2
-    for kept in (plain, noisy):
-        kept.correct(frame)
-    assert plain.belief[:, 3, 4].tolist() == [0, 0, 1]
-    posterior = shows[2] * before
-    assert np.allclose(noisy.belief[:, 3, 4], posterior / posterior.sum(), atol=1e-6)
-    with refuses("expected a model, got none|expected one, got none"):
-        neural(kind="neural+sensor")
-    alike = MODEL.toml.replace(
-        str(MODEL.observation_matrix[0].tolist()), str(MODEL.observation_matrix[1].tolist()), 1
-    )
-    with refuses("sensor: expected an invertible observation matrix, got states that look alike"):
-        neural(kind="neural+sensor", model=Model.from_toml(alike))
+    rows = (str(row.tolist()) for row in MODEL.observation_matrix[:2])
+    alike = Model.from_toml(MODEL.toml.replace(*rows, 1))
+    for model, words in (
+        (None, "expected a model, got none|expected one, got none"),
+        (alike, "sensor: expected an invertible observation matrix, got states that look alike"),
+    ):
+        with refuses(words):
+            belief.load(checkpoints / "neural_belief", **GRID, kind="neural+sensor", model=model)
 
 
 def test_an_impossible_frame_names_its_world() -> None:

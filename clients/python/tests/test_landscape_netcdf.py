@@ -80,6 +80,7 @@ def test_unsupported_attributes_are_refused_by_name(
          case(**axes([15, 45, np.nan, 105]))),
         ("expected a variable with the dimensions time, rows and columns, got one with level, y, x",
          case(("level", "y", "x"), FIRE[:4])),
+        ("a.nc: expected cells, got an array of shape (0, 4)", case(values=ARRIVAL[:0])),
         ("a.nc: expected one variable, got 0 (none)", case(("y",), ARRIVAL[:, 0])),
         ("a.nc: expected a NetCDF file, got: ", case(given={"units": "fires since 2020-08-01"})),
         ("expected times in days or smaller units, got 'm'; give the", case(given={"units": "m"})),

@@ -44,6 +44,8 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
 
 
 def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
+    if 0 in array.shape:
+        raise invalid(file, "cells", f"an array of shape {array.shape}")
     rows = _dimension(array, _ROWS, array.dims[-2])
     columns = _dimension(array, _COLUMNS, array.dims[-1])
     array = array.transpose(..., rows, columns)
