@@ -28,10 +28,10 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
     options = {"engine": "netcdf4", "decode_coords": "all", "decode_timedelta": False}
     with warnings.catch_warnings(action="ignore"):
         try:
-            with xarray.open_dataset(path, cache=False, **options) as file_:
+            with xarray.open_dataset(path, cache=False, **options) as dataset:
                 arrays = {
                     str(name): array
-                    for name, array in file_.data_vars.items()
+                    for name, array in dataset.data_vars.items()
                     if array.ndim > 1 and array.dtype.kind in "biufM"
                 }
                 name = choose_variable(file, list(arrays), choice.variable)
