@@ -3,7 +3,7 @@
 use crate::detached::detached;
 use crate::errors::{check_memory, raised};
 use crate::model::shape_of;
-use crate::origin::{Origin, checkpoint_bytes, kind_of, no_prior, unfit};
+use crate::origin::{Origin, checkpoint_bytes, kind_of, unfit};
 use crate::refusal::{failed, invalid, refused};
 use crate::saved::{Saved, is_saved};
 use crate::threads::Pool;
@@ -13,11 +13,13 @@ use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
 use emberwatch_belief::estimation::scoring::score;
 use emberwatch_learning::file::replace_file;
-use emberwatch_model::frame::FrameError;
 use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_model::text::shortened;
 use emberwatch_model::{Frame, Grid, Model, Shape};
 use numpy::ndarray::{Array3, Array4, ArrayView3, Axis};
-use numpy::{IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3};
+use numpy::{
+    Element, IntoPyArray, PyArray1, PyArray3, PyArray4, PyReadonlyArray1, PyReadonlyArray3,
+};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyTuple};
 use std::any::Any;
@@ -55,9 +57,10 @@ pub struct Estimators {
 /// The estimators, which only one call at a time may use.
 struct State {
     worlds: Vec<Box<dyn Estimator>>,
-    /// Number of predictions of each world since the first belief. `None` if a signal interrupted a call, so that it is
-    /// unknown whether the call changed the world's belief.
-    steps: Vec<Option<u64>>,
+    /// Number of predictions of each world since the first belief.
+    steps: Vec<u64>,
+    /// Whether a signal interrupted a call, so that it is unknown which beliefs the call changed.
+    is_unfinished: bool,
 }
 
 /// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds of estimators.
@@ -84,7 +87,7 @@ impl Estimators {
         let (_, height, width) = prior.as_array().dim();
         shape_of(py, height, width)?;
         let prior = Belief::from_probabilities(prior.as_array().to_owned());
-        let prior = prior.map_err(|error| no_prior(py, error))?;
+        let prior = prior.map_err(|error| refused(py, format!("prior: {error}")))?;
         Self::new(py, Origin::known(py, model, prior, kind)?.into(), n_worlds)
     }
 
@@ -153,8 +156,9 @@ impl Estimators {
     }
 
     /// Returns the number of predictions of each world since the first belief. `None` after an interrupted call.
-    fn steps(&self, py: Python<'_>) -> PyResult<Vec<Option<u64>>> {
-        Ok(self.locked(py)?.steps.clone())
+    fn steps(&self, py: Python<'_>) -> PyResult<Option<Vec<u64>>> {
+        let state = self.locked(py)?;
+        Ok((!state.is_unfinished).then(|| state.steps.clone()))
     }
 
     /// Draws each cell's state from its own distribution, `[n, H, W]`.
@@ -163,16 +167,9 @@ impl Estimators {
             let got = format!("'{}', which predicts observations", self.kind);
             return Err(invalid(py, "sample", "a belief about states", got));
         }
-        let mut state = self.state(py)?;
-        let worlds = &mut state.worlds;
-        let (height, width) = self.shape.dim();
-        let mut out = Array3::zeros((worlds.len(), height, width));
-        let tasks = worlds.iter_mut().zip(out.outer_iter_mut()).enumerate();
-        self.each(py, false, tasks, |(index, (world, mut out))| {
-            let mut rng = stream(seed, Purpose::Sample, index as u64);
-            out.assign(&world.belief().sample(&mut rng));
-        })?;
-        Ok(out.into_pyarray(py))
+        self.of_cells(py, false, |index, belief| {
+            belief.sample(&mut stream(seed, Purpose::Sample, index as u64))
+        })
     }
 
     /// Returns the number of worlds, the height and the width.
@@ -196,15 +193,7 @@ impl Estimators {
 
     /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
-        let mut state = self.state(py)?;
-        let worlds = &mut state.worlds;
-        let (height, width) = self.shape.dim();
-        let mut out = Array3::zeros((worlds.len(), height, width));
-        let tasks = worlds.iter_mut().zip(out.outer_iter_mut());
-        self.each(py, true, tasks, |(world, mut out)| {
-            out.assign(&world.belief().entropy(EntropyKind::Sum));
-        })?;
-        Ok(out.into_pyarray(py))
+        self.of_cells(py, true, |_, belief| belief.entropy(EntropyKind::Sum))
     }
 
     /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep the correlations
@@ -217,7 +206,7 @@ impl Estimators {
     ) -> PyResult<()> {
         let mut state = self.locked(py)?;
         let chosen = chosen.as_slice()?;
-        let State { worlds, steps } = &mut *state;
+        let State { worlds, steps, .. } = &mut *state;
         let tasks = worlds.iter_mut().zip(steps).zip(chosen);
         let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
         let reset = self.each(py, false, tasks, |(world, step)| {
@@ -230,8 +219,9 @@ impl Estimators {
         // Either all worlds are reset, or none.
         let reset: anyhow::Result<Vec<_>> = reset?.into_iter().collect();
         for (world, step, new) in reset.map_err(|error| raise(py, &error))? {
-            (*world, *step) = (new, Some(0));
+            (*world, *step) = (new, 0);
         }
+        state.is_unfinished &= chosen.contains(&false);
         Ok(())
     }
 
@@ -245,14 +235,13 @@ impl Estimators {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
         let frames = self.frames(py, frames.as_array(), chosen)?;
-        let State { worlds, steps } = &mut *state;
-        let tasks = worlds.iter_mut().zip(frames).enumerate();
+        let tasks = state.worlds.iter_mut().zip(frames).enumerate();
         let corrected = self.each(py, false, tasks, |(index, (world, frame))| {
             let corrected = world.correct(&frame?);
             Some((index, corrected.err()?))
         });
-        let refused = corrected.inspect_err(|_| forget(steps, chosen))?;
-        let (refused, errors): (Vec<usize>, Vec<_>) = refused.into_iter().flatten().unzip();
+        state.is_unfinished = corrected.is_err();
+        let (refused, errors): (Vec<usize>, Vec<_>) = corrected?.into_iter().flatten().unzip();
         let Some(first) = errors.into_iter().next() else {
             return Ok(());
         };
@@ -273,15 +262,14 @@ impl Estimators {
     fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
-        let State { worlds, steps } = &mut *state;
-        let tasks = worlds.iter_mut().zip(chosen);
+        let tasks = state.worlds.iter_mut().zip(chosen);
         let tasks = tasks.filter_map(|(world, &chosen)| chosen.then_some(world));
         let predicted = self.each(py, false, tasks, |world| world.predict());
-        predicted.inspect_err(|_| forget(steps, chosen))?;
-        for (step, &chosen) in steps.iter_mut().zip(chosen) {
-            *step = step.map(|step| step + u64::from(chosen));
+        state.is_unfinished = predicted.is_err();
+        for (step, &chosen) in state.steps.iter_mut().zip(chosen) {
+            *step += u64::from(chosen);
         }
-        Ok(())
+        predicted.map(|_| ())
     }
 
     /// Scores the beliefs against hidden states `[n, H, W]`. Returns three arrays with one value per world: log losses,
@@ -358,7 +346,11 @@ impl Estimators {
             let observation_model = kind.traits.observation_model?(&**first?);
             Some(observation_model.likelihood()?.ncols())
         });
-        let steps = vec![Some(0); n_worlds];
+        let state = State {
+            worlds,
+            steps: vec![0; n_worlds],
+            is_unfinished: false,
+        };
         Ok(Self {
             kind: kind.name,
             n_observations: of_model.or(of_belief).unwrap_or(state_names.len()),
@@ -367,7 +359,7 @@ impl Estimators {
             n_worlds,
             is_single,
             shape: origin.shape,
-            state: Mutex::new(State { worlds, steps }),
+            state: Mutex::new(state),
             threads: Mutex::new(threads),
             origin,
         })
@@ -381,13 +373,13 @@ impl Estimators {
             return Err(invalid(py, "belief", expected, got));
         };
         let mut state = self.state(py)?;
-        let State { worlds, steps } = &mut *state;
+        let State { worlds, steps, .. } = &mut *state;
         let what = format_args!("a copy of the beliefs about {} worlds", self.n_worlds);
         let of_world = handover(&*worlds[0]).to_bytes().len();
         check_memory(py, what, self.n_worlds.saturating_mul(2 * of_world))?;
         let save = |world: &mut Box<dyn Estimator>| handover(&**world).to_bytes();
         let worlds = self.each(py, false, worlds.iter_mut(), save)?;
-        Ok(steps.iter().flatten().copied().zip(worlds).collect())
+        Ok(steps.iter().copied().zip(worlds).collect())
     }
 
     fn encoded(&self, py: Python<'_>) -> PyResult<Vec<u8>> {
@@ -409,9 +401,8 @@ impl Estimators {
     /// Restores all worlds from numbers of predictions and states that beliefs with the same sources have saved.
     fn restore<W: AsRef<[u8]> + Sync>(&self, py: Python<'_>, saved: &[(u64, W)]) -> PyResult<()> {
         let mut state = self.state(py)?;
-        let State { worlds, steps } = &mut *state;
         let handover = self.origin.kind.traits.handover_mut;
-        let tasks = worlds.iter_mut().zip(saved);
+        let tasks = state.worlds.iter_mut().zip(saved);
         let restored = self.each(py, false, tasks, |(world, (_, saved))| {
             handover.is_some_and(|it| it(&mut **world).restore(saved.as_ref()))
         })?;
@@ -421,7 +412,7 @@ impl Estimators {
             let got = "others, or a prediction that failed";
             return Err(invalid(py, "belief", expected, got));
         }
-        *steps = saved.iter().map(|it| Some(it.0)).collect();
+        state.steps = saved.iter().map(|it| it.0).collect();
         Ok(())
     }
 
@@ -445,6 +436,28 @@ impl Estimators {
         done.ok_or_else(raised)
     }
 
+    /// Computes an array `[n, H, W]` from the belief about each world.
+    fn of_cells<'py, T: Element + Copy + Default + Send>(
+        &self,
+        py: Python<'py>,
+        is_cheap: bool,
+        work: impl Fn(usize, &Belief) -> Grid<T> + Sync + Send,
+    ) -> PyResult<Bound<'py, PyArray3<T>>> {
+        let mut state = self.state(py)?;
+        let (height, width) = self.shape.dim();
+        let mut out = Array3::default((self.n_worlds, height, width));
+        let tasks = state.worlds.iter_mut().zip(out.outer_iter_mut());
+        self.each(
+            py,
+            is_cheap,
+            tasks.enumerate(),
+            |(index, (world, mut out))| {
+                out.assign(&work(index, world.belief()));
+            },
+        )?;
+        Ok(out.into_pyarray(py))
+    }
+
     /// Returns the number of probabilities in the belief about one world.
     fn n_numbers(&self) -> usize {
         self.state_names.len() * self.shape.n_cells()
@@ -456,14 +469,11 @@ impl Estimators {
     /// If another thread is using them, or a signal interrupted an earlier call.
     fn state(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
         let state = self.locked(py)?;
-        let worlds = 0..self.n_worlds;
-        let unknown: Vec<usize> = worlds.filter(|&it| state.steps[it].is_none()).collect();
-        if unknown.is_empty() {
-            return Ok(state);
+        if state.is_unfinished {
+            let problem = "belief: an interrupted call left it unfinished: reset all worlds first";
+            return Err(failed(py, problem, "interrupted"));
         }
-        let worlds = named(&unknown);
-        let problem = format!("belief: an interrupted call left {worlds} unfinished: reset first");
-        Err(failed(py, &problem, "interrupted"))
+        Ok(state)
     }
 
     /// Like [`Self::state`], but also locks unfinished beliefs.
@@ -490,42 +500,17 @@ impl Estimators {
         let frame = |(frame, &chosen): (numpy::ndarray::ArrayView2<'_, u8>, &bool)| {
             let bytes = frame.to_slice().expect("invariant: row-major");
             let frame = chosen.then(|| Frame::from_bytes(self.shape, self.n_observations, bytes));
-            frame.transpose().map_err(|error| self.no_frame(py, &error))
+            frame.transpose().map_err(|error| refused(py, error))
         };
         worlds.map(frame).collect()
     }
-
-    fn no_frame(&self, py: Python<'_>, error: &FrameError) -> PyErr {
-        let FrameError::Value {
-            index,
-            value,
-            n_observations,
-        } = error
-        else {
-            return refused(py, error);
-        };
-        let subject = format!("frame: cell {}", self.shape.cell(*index));
-        let expected = format!("a value below {n_observations}, or 255");
-        invalid(py, subject, expected, value)
-    }
 }
 
-/// Marks the chosen worlds after an interrupted call.
-fn forget(steps: &mut [Option<u64>], chosen: &[bool]) {
-    let steps = steps.iter_mut().zip(chosen);
-    steps.filter(|it| *it.1).for_each(|(step, _)| *step = None);
-}
-
-/// Names worlds for an error: all, or the first eight and how many more.
+/// Names worlds for an error; of many, the first and the last.
 fn named(worlds: &[usize]) -> String {
-    let (shown, more) = worlds.split_at(worlds.len().min(8));
-    let numbers: Vec<String> = shown.iter().map(usize::to_string).collect();
+    let numbers: Vec<String> = worlds.iter().map(usize::to_string).collect();
     let plural = if worlds.len() > 1 { "s" } else { "" };
-    let more = match more.len() {
-        0 => String::new(),
-        n => format!(" and {n} more"),
-    };
-    format!("world{plural} {}{more}", numbers.join(", "))
+    format!("world{plural} {}", shortened(&numbers.join(", ")))
 }
 
 /// Creates the exception for a belief that could not be built, or could not be corrected with a frame.

@@ -1,6 +1,5 @@
 //! Figures of merit of runs on several worlds.
 
-use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
 use emberwatch_belief::merit::{self, Found};
@@ -32,12 +31,6 @@ impl MeritTally {
         target: u8,
     ) -> PyResult<Self> {
         let shape = shape_of(py, height, width)?;
-        let n_bytes = n_worlds.saturating_mul(size_of::<u32>() * shape.n_cells());
-        check_memory(
-            py,
-            format_args!("the figures of merit of {n_worlds} worlds"),
-            n_bytes,
-        )?;
         let tally = merit::MeritTally::new(shape, target);
         Ok(Self {
             shape,
@@ -100,41 +93,20 @@ impl MeritTally {
     ) -> PyResult<()> {
         let (height, width) = self.shape.dim();
         let grids = (self.worlds.len(), height, width);
-        let fits = |name, got: (usize, usize, usize)| {
-            if got == grids {
-                return Ok(());
-            }
-            let (expected, got) = (format!("shape {grids:?}"), format!("{got:?}"));
-            Err(invalid(py, name, expected, got))
-        };
-        fits("visited", visited.dim())?;
-        fits("states", states.map_or(grids, |states| states.dim()))?;
-        if counts.iter().any(|counts| counts.len() != grids.0) {
-            let expected = format!("one entry for each of {} worlds", grids.0);
-            return Err(invalid(py, "n_hits, n_burning", expected, "other lengths"));
-        }
-        let (n_worlds, n_robots, n_axes) = robots.dim();
-        if n_worlds != grids.0 || n_robots == 0 || n_axes != 2 {
-            let expected = format!("shape ({}, R, 2)", grids.0);
-            return Err(invalid(
-                py,
-                "robots",
-                expected,
-                format!("{:?}", robots.dim()),
-            ));
-        }
+        let (n_worlds, _, n_axes) = robots.dim();
         let is_on_grid = |cell: ArrayView1<'_, i64>| {
             (0..height as i64).contains(&cell[0]) && (0..width as i64).contains(&cell[1])
         };
-        match robots.rows().into_iter().find(|cell| !is_on_grid(*cell)) {
-            None => Ok(()),
-            Some(cell) => Err(invalid(
-                py,
-                "robots",
-                format!("cells of a {} grid", self.shape),
-                cell,
-            )),
+        let fits = visited.dim() == grids
+            && states.is_none_or(|states| states.dim() == grids)
+            && counts.iter().all(|counts| counts.len() == grids.0)
+            && (n_worlds, n_axes) == (grids.0, 2)
+            && robots.rows().into_iter().all(is_on_grid);
+        if fits {
+            return Ok(());
         }
+        let expected = format!("arrays of {} worlds of {}", grids.0, self.shape);
+        Err(invalid(py, "step", expected, "others"))
     }
 }
 

@@ -89,7 +89,8 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
     let observations = file.observations.iter();
     let fields = PyDict::new(py);
     fields.set_item("name", model.name())?;
-    fields.set_item("state_names", names(py, states.clone().map(|it| &it.name))?)?;
+    let names: Vec<_> = states.clone().map(|it| &it.name).collect();
+    fields.set_item("state_names", PyTuple::new(py, names)?)?;
     fields.set_item("state_colors", colors(py, states.map(|it| &it.color))?)?;
     fields.set_item(
         "observation_names",
@@ -114,13 +115,6 @@ fn airspace<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>>
     let no_fly = no_fly.map(|map| map.mapv(|flag| flag != 0).to_pyarray(py));
     fields.set_item("no_fly", no_fly)?;
     Ok(fields)
-}
-
-fn names<'a, 'py>(
-    py: Python<'py>,
-    of: impl Iterator<Item = &'a String>,
-) -> PyResult<Bound<'py, PyTuple>> {
-    PyTuple::new(py, of.collect::<Vec<_>>())
 }
 
 fn colors<'a, 'py>(

@@ -2,18 +2,17 @@
 
 use crate::errors::{check_memory, raised, warn};
 use crate::model::{model_of, shape_of};
-use crate::prior::vanishing;
 use crate::refusal::{invalid, refused};
 use crate::saved::Saved;
 use crate::threads::Pool;
-use emberwatch_acting::beliefs::{BELIEFS, BeliefKind, Conditions, Input, KNOWN, WorldForm, named};
+use emberwatch_acting::beliefs::{BELIEFS, BeliefKind, Conditions, Input, KNOWN, WorldForm};
 use emberwatch_acting::learned::{Learned, WorldNames};
 use emberwatch_acting::options::usual;
-use emberwatch_belief::estimation::belief::{Belief, BeliefError};
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::Estimator;
 use emberwatch_learning::checkpoint::read_bytes;
 use emberwatch_learning::learners;
-use emberwatch_model::{Model, ModelError, Shape};
+use emberwatch_model::{Model, Shape};
 use pyo3::prelude::*;
 use pyo3::types::PyString;
 use std::borrow::Cow;
@@ -217,33 +216,18 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
 
 /// Finds a kind of belief by its name, either among the learned kinds or among the kinds that need only a model.
 pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static BeliefKind> {
-    let serves =
-        |kind: &&BeliefKind| kind.input == Input::Frames && kind.learned_by.is_some() == is_learned;
+    let kinds = || of_frames().filter(|kind| kind.learned_by.is_some() == is_learned);
     // Text that UTF-8 cannot encode is treated as an unknown name.
-    let found = name.extract::<&str>().ok().and_then(named);
-    if let Some(kind) = found.filter(serves) {
+    let text = name.extract::<&str>().unwrap_or_default();
+    if let Some(kind) = kinds().find(|kind| kind.name == text) {
         return Ok(kind);
     }
-    let names: Vec<&str> = of_frames().filter(serves).map(|kind| kind.name).collect();
+    let names: Vec<&str> = kinds().map(|kind| kind.name).collect();
     let expected = format!("one of {}", names.join(", "));
     Err(invalid(name.py(), "kind", expected, name.repr()?))
 }
 
-/// Creates the exception for a prior that is not a valid belief.
-pub fn no_prior(py: Python<'_>, error: BeliefError) -> PyErr {
-    match error {
-        BeliefError::Simplex { cell, got } => {
-            let (subject, got) = (format!("prior: cell {cell}"), format!("{got:?}"));
-            invalid(py, subject, "probabilities >= 0 with sum 1", got)
-        }
-        other => refused(py, format!("prior: {other}")),
-    }
-}
-
 /// Creates the exception for a model or a checkpoint from which no belief can be built.
 pub fn unfit(py: Python<'_>, error: &anyhow::Error) -> PyErr {
-    match error.downcast_ref::<ModelError>() {
-        Some(error) => vanishing(py, error),
-        None => refused(py, format!("{error:#}")),
-    }
+    refused(py, format!("{error:#}"))
 }

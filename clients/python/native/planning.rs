@@ -7,15 +7,12 @@ use crate::refusal::invalid;
 use emberwatch_belief::planning::objective::CellValues;
 use emberwatch_belief::planning::{BeamSearch, PlanningProblem};
 use emberwatch_messages::errors::ChannelError;
-use emberwatch_model::path::{MAX_MOVES, path_to_bytes};
+use emberwatch_model::path::path_to_bytes;
 use emberwatch_model::{Airspace, Cell, Shape};
 use numpy::ndarray::{Array2, ArrayView1};
 use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
 use std::time::{Duration, Instant};
-
-/// Maximum width of a beam.
-const MAX_WIDTH: usize = 1 << 16;
 
 /// Maximum memory of a beam, in bytes.
 const MAX_BYTES: usize = 1 << 32;
@@ -23,8 +20,8 @@ const MAX_BYTES: usize = 1 << 32;
 /// Interval at which a search checks for Ctrl-C.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// Plans a path for each world. `values`, `[n, H, W]`, are finite; `robots`, `[n, 2]`, are cells of the grid; `keys`,
-/// `[n]`, break ties.
+/// Plans a path for each world. `values`, `[n, H, W]`, are finite; `robots` has shape `[n, 2]`; `keys`, `[n]`, break
+/// ties. Python has checked that `n_moves` and `width` are in range.
 #[pyfunction]
 #[pyo3(signature = (values, robots, keys, n_moves, width, airspace=None))]
 pub fn beam_search<'py>(
@@ -64,6 +61,10 @@ pub fn beam_search<'py>(
             row: robot[0] as usize,
             col: robot[1] as usize,
         };
+        if !shape.contains(start) || !airspace.is_free(start) {
+            let expected = format!("cells of a {shape} grid where they may fly");
+            return Err(invalid(py, "robots", expected, robot));
+        }
         let problem = PlanningProblem {
             start,
             n_moves,
@@ -78,24 +79,21 @@ pub fn beam_search<'py>(
     Ok(paths.into_pyarray(py))
 }
 
-/// Checks that the arguments are in range, and that the beam's memory is within the limit and available.
+/// Checks that the beam's memory is within the limit and available.
 fn check(
     py: Python<'_>,
     shape: Shape,
     n_moves: usize,
     (width, n_kept): (usize, usize),
 ) -> PyResult<()> {
-    let within = |max: usize| format!("an integer within 1 to {max}");
-    if !(1..=MAX_MOVES).contains(&n_moves) {
-        return Err(invalid(py, "n_moves", within(MAX_MOVES), n_moves));
-    }
     let reach = |side: usize| side.min(2 * n_moves + 1);
     let set_bytes = (reach(shape.height()) * reach(shape.width())).div_ceil(64) * 8;
     // Each state has two sets of cells, for before and after a move, and one link per move to the previous state.
     let state_bytes = 2 * set_bytes + n_moves * 8;
-    let widest = MAX_WIDTH.min(MAX_BYTES / state_bytes);
-    if !(1..=widest).contains(&width) {
-        return Err(invalid(py, "width", within(widest), width));
+    let widest = MAX_BYTES / state_bytes;
+    if width > widest {
+        let expected = format!("an integer within 1 to {widest}");
+        return Err(invalid(py, "width", expected, width));
     }
     check_memory(
         py,

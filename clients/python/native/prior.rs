@@ -1,19 +1,14 @@
 //! Priors: beliefs before the first frame, and their simulation.
 
-use crate::errors::{check_memory, no_threads};
+use crate::errors::{check_memory, no_threads, raised};
 use crate::model::{model_of, shape_of};
-use crate::refusal::{failed, invalid};
+use crate::refusal::refused;
+use crate::threads::watched;
 use emberwatch_belief::{Belief, estimation::KeptBelief, estimation::Prior};
-use emberwatch_messages::limits::threads::NoThreads;
-use emberwatch_model::{Model, ModelError, Shape};
+use emberwatch_model::{Model, Shape};
 use numpy::{PyArray3, ToPyArray};
 use pyo3::prelude::*;
 use rayon::ThreadPoolBuilder;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
-
-/// Time between two checks for Ctrl-C in a long computation.
-const LOOK: Duration = Duration::from_millis(2);
 
 /// Simulates 64 worlds. Returns the share of worlds in which each cell is in each state after the burn-in, `[S, H, W]`.
 #[pyfunction]
@@ -49,7 +44,6 @@ pub fn first_belief(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -
 
 /// Simulates a prior on new threads, because a global pool is unusable after a fork. Ctrl-C ends the simulation.
 fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyResult<Belief> {
-    let cancelled = AtomicBool::new(false);
     let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
     // Each thread simulates one world at a time, and counts for each cell how often each state occurs.
     let of_thread = shape.n_cells() * (model.n_states() * size_of::<u32>() + 5);
@@ -57,44 +51,12 @@ fn simulated(py: Python<'_>, prior: Prior, model: &Model, shape: Shape) -> PyRes
     check_memory(py, "the worlds of a first belief", n_bytes)?;
     let pool = emberwatch_sim::limits::start(ThreadPoolBuilder::new(), n_threads);
     let pool = pool.map_err(|short| no_threads(py, &short))?;
-    let simulated = std::thread::scope(|scope| {
-        let work = || pool.install(|| prior.belief_unless(&cancelled, model, shape, 0));
-        let worker = std::thread::Builder::new().spawn_scoped(scope, work);
-        let worker = worker.map_err(|error| no_threads(py, &NoThreads::new(1, &error)))?;
-        while !worker.is_finished() {
-            py.detach(|| std::thread::sleep(LOOK));
-            if let Err(interrupt) = py.check_signals() {
-                cancelled.store(true, Ordering::Relaxed);
-                return Err(interrupt);
-            }
-        }
-        Ok(worker.join())
-    })?;
-    match simulated {
-        Ok(Ok(Some(belief))) => Ok(belief),
-        Ok(Err(error)) => Err(vanishing(py, &error)),
-        Ok(Ok(None)) | Err(_) => Err(failed(
-            py,
-            "the first belief could not be simulated",
-            "program",
-        )),
-    }
-}
-
-/// Creates the exception for a model whose transition weights can all be 0, or can lose their precision.
-pub fn vanishing(py: Python<'_>, error: &ModelError) -> PyErr {
-    match error {
-        ModelError::ZeroWeight { cell, .. } => {
-            let subject = format!("model: transition weights of cell {cell}");
-            let got = "weights that can all be 0";
-            invalid(py, subject, "a positive sum for every neighbourhood", got)
-        }
-        ModelError::Value {
-            what,
-            expected,
-            got,
-            ..
-        } => invalid(py, format!("model: {what}"), expected, got),
-        other => invalid(py, "model", "weights that keep their precision", other),
-    }
+    let made = py.detach(|| {
+        watched(&pool, |cancelled| {
+            prior.belief_unless(cancelled, model, shape, 0)
+        })
+    });
+    let belief = made.ok_or_else(raised)?;
+    let belief = belief.map_err(|error| refused(py, error))?;
+    Ok(belief.expect("invariant: `watched` alone cancels it"))
 }

@@ -56,26 +56,12 @@ impl Pool {
             };
             return tasks.into_iter().map(unless_interrupted).collect();
         };
-        let is_over = AtomicBool::new(false);
-        let (sender, receiver) = channel();
-        threads.in_place_scope(|scope| {
-            let unless_over = |task| (!is_over.load(Ordering::Relaxed)).then(|| work(task));
-            scope.spawn(move |_| {
-                // After an interrupt, nobody receives the results.
-                let _ = sender.send(in_parallel(tasks, unless_over));
-            });
-            loop {
-                match receiver.recv_timeout(LOOK) {
-                    Ok(results) => return results.into_iter().collect(),
-                    Err(RecvTimeoutError::Timeout) if !interrupted() => {}
-                    // If a task panicked, the scope passes the panic to this thread.
-                    Err(_) => {
-                        is_over.store(true, Ordering::Relaxed);
-                        return None;
-                    }
-                }
-            }
-        })
+        let results = watched(threads, |is_over| {
+            in_parallel(tasks, |task| {
+                (!is_over.load(Ordering::Relaxed)).then(|| work(task))
+            })
+        });
+        results?.into_iter().collect()
     }
 
     /// Returns the pool's threads; `None` if the work is short, or if the system could not start threads.
@@ -98,6 +84,33 @@ impl Pool {
             std::mem::forget(self.threads.take());
         }
     }
+}
+
+/// Runs `work` on threads, while this thread handles signals. If a signal handler raises an exception, sets the flag
+/// that `work` receives, waits for its end, and returns `None`.
+pub fn watched<R: Send>(
+    threads: &ThreadPool,
+    work: impl FnOnce(&AtomicBool) -> R + Send,
+) -> Option<R> {
+    let is_over = &AtomicBool::new(false);
+    let (sender, receiver) = channel();
+    threads.in_place_scope(|scope| {
+        scope.spawn(move |_| {
+            // After an interrupt, nobody receives the result.
+            let _ = sender.send(work(is_over));
+        });
+        loop {
+            match receiver.recv_timeout(LOOK) {
+                Ok(result) => return Some(result),
+                Err(RecvTimeoutError::Timeout) if !interrupted() => {}
+                // If the work panicked, the scope passes the panic to this thread.
+                Err(_) => {
+                    is_over.store(true, Ordering::Relaxed);
+                    return None;
+                }
+            }
+        }
+    })
 }
 
 impl Drop for Pool {

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import netCDF4
 import numpy as np
+import pytest
 import rasterio
+import xarray
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch.landscape.__main__ import main
@@ -19,12 +20,38 @@ ARRIVAL = np.array([[0, 10, 20, NEVER], [10, 20, 35, NEVER], [NEVER, 30, 40, 50]
 UTM = "EPSG:32610"
 #: Elevation in metres that rises by 10 degrees to the east on cells of 30 m.
 EASTWARD = np.tile(np.arange(5) * 30 * math.tan(math.radians(10)), (4, 1))
+X, Y = 500_015 + 30.0 * np.arange(4), 4_000_075 - 30.0 * np.arange(3)
+
+
+def worlds(*flags: object) -> list[NDArray[np.uint8]]:
+    """Imports files that the flags name. Returns the sequences."""
+    out = Path(str(flags[0])).parent / "new" / "world.npz"
+    main([str(flag) for flag in (*flags, "--out", out, "--force")])
+    with np.load(out) as file:
+        assert list(file) == [f"states_{number:03}" for number in range(len(file))]
+        return [file[name] for name in file]
+
+
+def world(*flags: object) -> NDArray[np.uint8]:
+    (states,) = worlds(*flags)
+    assert states.dtype == np.uint8
+    return states
 
 
 def made(folder: Path, *flags: object) -> dict[str, Any]:
+    """Makes a model of land. Returns the content of its file."""
     out = folder / "new" / "land.toml"
     main([str(flag) for flag in ("land", *flags, "--out", out, "--force")])
     return tomllib.loads(out.read_text("utf-8"))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *flags: object) -> str:
+    """Returns the line with which the command refuses the flags."""
+    with pytest.raises(SystemExit) as stopped:
+        main([str(flag) for flag in flags])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert stopped.value.code == 2 and line.startswith("python -m emberwatch.landscape")
+    return line
 
 
 def geotiff(
@@ -32,7 +59,7 @@ def geotiff(
     *bands: ArrayLike,
     nodata: float | None = NEVER,
     crs: str | None = UTM,
-    corner: tuple[float, float] = (500_000, 4_000_000),
+    corner: tuple[float, float] = (500_000, 4_000_090),
     cell: tuple[float, float] = (30, 30),
     **profile: Any,
 ) -> Path:
@@ -59,43 +86,22 @@ def ascii_grid(path: Path, values: NDArray[Any] = ARRIVAL, *, side: str = "cells
 
 def netcdf(
     path: Path,
+    values: ArrayLike = ARRIVAL,
+    unit: str = "min",
     *,
     times: Sequence[float] | None = None,
-    time_unit: str | None = None,
-    calendar: str | None = None,
-    unit: str = "min",
-    southward: bool = True,
-    extra: bool = False,
-    over: tuple[str, str, str] = ("time", "y", "x"),
-    **variables: ArrayLike,
+    time_unit: str = "",
+    over: Sequence[str] = ("time", "y", "x"),
+    **coordinates: Any,
 ) -> Path:
-    """Writes a NetCDF file of variables over rows and columns, or over the dimensions `over`."""
-    file = netCDF4.Dataset(path, "w")
-    arrays = {name: np.asarray(values, "f4") for name, values in variables.items()}
-    height, width = next(iter(arrays.values())).shape[-2:]
-    dimensions = {"y": np.arange(height)[:: -1 if southward else 1] * 30.0 + 15}
-    dimensions |= {"x": np.arange(width) * 30.0 + 15}
+    """Writes a variable `v` with coordinates, `y` and `x` in metres unless others are given."""
+    values = np.asarray(values)
+    coordinates = coordinates or {"y": ("y", Y, {"units": "m"}), "x": ("x", X, {"units": "m"})}
     if times is not None:
-        dimensions = {"time": np.array(times)} | dimensions
-    dimensions |= {name: np.arange(2.0) for name in over if times and name not in dimensions}
-    if extra:
-        dimensions = {"level": np.arange(2.0)} | dimensions
-    for name, places in dimensions.items():
-        file.createDimension(name, len(places))
-        axis = file.createVariable(name, "f8", (name,))
-        axis[:] = places
-        if name in "xy":
-            axis.units, axis.standard_name = "m", f"projection_{name}_coordinate"
-        if name == "time" and time_unit is not None:
-            axis.units = time_unit
-        if name == "time" and calendar is not None:
-            axis.calendar = calendar
-    names = tuple(dimensions) if times is None or extra else over
-    for name, values in arrays.items():
-        variable = file.createVariable(name, "f4", names, fill_value=NEVER)
-        variable[:] = values if southward else values[..., ::-1, :]
-        variable.units = unit
-    file.close()
+        coordinates["time"] = "time", np.array(times, "f8"), {"units": time_unit}
+    array = xarray.DataArray(values, coordinates, over[-values.ndim :], attrs={"units": unit})
+    encoding = {"_FillValue": NEVER} if values.dtype.kind == "f" else {}
+    array.to_dataset(name="v").to_netcdf(path, encoding={"v": encoding})
     return path
 
 

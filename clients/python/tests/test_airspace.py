@@ -237,7 +237,7 @@ def test_the_filter_uses_maps(tmp_path: Path) -> None:
     kept.predict()
     np.testing.assert_allclose(kept.belief, oracle.phi(expected, posterior), atol=1e-6)
     assert simulated_prior(model, height=7, width=5, burn_in=20).shape == (3, 7, 5)
-    with refuses("model: maps: expected a map of the 5 x 5 grid, got 7 x 5"):
+    with refuses("maps: expected a map of the 5 x 5 grid, got 7 x 5"):
         known(model, prior=np.full((3, 5, 5), 1 / 3))
 
 

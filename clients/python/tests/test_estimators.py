@@ -194,15 +194,18 @@ def test_wrong_certainty_has_infinite_loss() -> None:
 KNOWN_REFUSALS: list[tuple[dict[str, Any], str]] = [
     ({"model": 7}, "model: expected text or a path, got 7"),
     ({"kind": "learned"}, f"kind: expected one of {', '.join(KNOWN)}, got 'learned'"),
-    ({"kind": None}, f"kind: expected one of {', '.join(KNOWN)}, got None"),
     ({"kind": "\ud800"}, "got '\\ud800'"),
-    ({"prior": "uniform"}, "prior: expected numbers of shape (3, H, W), got 'uniform'"),
+    ({"prior": "uniform"}, "prior: expected numbers of shape (3, H, W), got <U7 of shape ()"),
     ({"prior": PRIOR[:2]}, "prior: expected numbers of shape (3, H, W), got float32 of shape (2,"),
-    ({"prior": np.ones((3, 1, 1), bool)}, "prior: expected numbers of shape (3, H, W), got bool"),
-    ({"prior": np.reshape([1.5, -0.5, 0.0], (3, 1, 1))}, "prior: cell (0, 0): expected probabil"),
-    ({"prior": np.full((3, 1, 1), np.nan)}, "prior: cell (0, 0): expected probabilities >= 0 with"),
+    (
+        {"prior": np.full((3, 1, 1), np.nan)},
+        "prior: belief of cell (0, 0): expected probabilities >= 0 wi",
+    ),
+    (
+        {"prior": np.full((3, 1, 1), 1e99)},
+        "prior: belief of cell (0, 0): expected probabilities >= 0 wi",
+    ),
     ({"n_worlds": 0}, "n_worlds: expected an integer within 1 to 1048576, got 0"),
-    ({"n_worlds": True}, "n_worlds: expected an integer within 1 to 1048576, got True"),
 ]
 
 
@@ -218,44 +221,21 @@ TRUTH = np.zeros((16, 16), np.uint8)
 WORLDS = "worlds: expected a mask of 3 worlds, indices from 0 to 2, or a slice, got "
 
 
-def of_frame(value: int) -> NDArray[np.uint8]:
-    """Returns two frames whose only observed value is in the last cell of the second."""
-    frames = np.stack([FRAME, FRAME])
-    frames[1, -1, -1] = value
-    return frames
-
-
 #: Wrong calls of a belief about one world or about three, and the errors.
 REFUSALS: list[tuple[int | None, Callable[[Belief], Any], str]] = [
     (3, lambda it: it.correct(FRAME),
         "frame: expected shape (3, 16, 16) and type uint8, got (16, 16) and uint8"),
     (None, lambda it: it.correct(np.full((16, 16), 3, np.uint8)),
-        "frame: cell (0, 0): expected a value below 3, or 255, got 3"),
+        "frame: cell 0: expected an observation below 3 or 255, got 3"),
     *((3, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}{worlds!r}")
-        for worlds in (3, [0, 3], [True, False], [0.5], True, [[0]], "0", 10**30)),
-    *((3, lambda it, worlds=worlds: it.predict(worlds), f"{WORLDS}slice({worlds.start!r},")
-        for worlds in (slice("a", None), slice(None, None, 0))),
+        for worlds in (3, [True, False], [0.5], "0", slice(None, None, 0))),
     (None, lambda it: it.reset(keep_correlations=1),  # pyright: ignore[reportArgumentType]
         "keep_correlations: expected True or False, got 1"),
     (None, lambda it: it.score_states(FRAME), "states: expected values below 3, got 255"),
     (None, lambda it: it.score_states(TRUTH, target=3),
-        "target: expected an integer within 0 to 2 (normal, latent, fire), got 3"),
-    *((None,
-        lambda it, target=target: belief.score(it, FRAME[None], TRUTH[None], target=target),
-        f"target: expected an integer within 0 to 2 (normal, latent, fire), got {target!r}")
-        for target in (9, -1, True, "fire")),
-    (None, lambda _: belief.score("known", FRAME[None], TRUTH[None]),  # pyright: ignore
-        "belief: expected a Belief of `known` or `load`, got 'known'"),
-    (None, lambda it: belief.score(it, FRAME, TRUTH),
-        "observations: expected shape (K, 16, 16) with K >= 1, and type uint8, got (16, 16)"),
-    (None, lambda it: belief.score(it, FRAME[None], TRUTH[None].astype(int)),
-        "states: expected shape (K, 16, 16) with K >= 1, and type uint8, got (1, 16, 16) and int"),
-    (None, lambda it: belief.score(it, of_frame(255), TRUTH[None]),
-        "states: expected 2 steps, as in observations, got 1"),
-    (None, lambda it: belief.score(it, of_frame(3), np.stack([TRUTH, TRUTH])),
-        "observations: step 1, cell (15, 15): expected a value below 3, or 255, got 3"),
-    (None, lambda it: belief.score(it, FRAME[None], FRAME[None]),
-        "states: step 0, cell (0, 0): expected a value below 3, got 255"),
+        "target: expected an integer within 0 to 2, got 3"),
+    (None, lambda it: belief.score(it, np.stack([FRAME, FRAME]), TRUTH[None]),
+        "states: expected 2 steps, as in observations, at least 1, got 1"),
 ]  # fmt: skip
 
 
@@ -286,33 +266,14 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
     for name in ("learned_filter", "neural_belief"):
         with refuses("checkpoint: expected the world's 4 observations, got 3"):
             belief.load(checkpoints / name, **GRID, model=model)
-
-
-def test_a_neural_belief_can_use_a_known_sensor(checkpoints: Path) -> None:
-    def neural(**keywords: Any) -> Belief:
-        return belief.load(checkpoints / "neural_belief", **GRID, **keywords)
-
-    plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
-    shows = MODEL.observation_matrix.T
-    # Beliefs may differ where inverting the sensor gives a negative probability, clamped to 0.
-    possible = (noisy.belief > 1e-5).all(0)
-    shown = np.tensordot(shows, noisy.belief, 1)
-    assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)
-    before = noisy.belief[:, 3, 4]
-    frame = np.full((16, 16), 255, np.uint8)
-    frame[3, 4] = 2
-    for kept in (plain, noisy):
-        kept.correct(frame)
-    assert plain.belief[:, 3, 4].tolist() == [0, 0, 1]
-    posterior = shows[2] * before
-    assert np.allclose(noisy.belief[:, 3, 4], posterior / posterior.sum(), atol=1e-6)
-    with refuses("expected a model, got none|expected one, got none"):
-        neural(kind="neural+sensor")
-    alike = MODEL.toml.replace(
-        str(MODEL.observation_matrix[0].tolist()), str(MODEL.observation_matrix[1].tolist()), 1
-    )
-    with refuses("sensor: expected an invertible observation matrix, got states that look alike"):
-        neural(kind="neural+sensor", model=Model.from_toml(alike))
+    rows = (str(row.tolist()) for row in MODEL.observation_matrix[:2])
+    alike = Model.from_toml(MODEL.toml.replace(*rows, 1))
+    for model, words in (
+        (None, "expected a model, got none|expected one, got none"),
+        (alike, "sensor: expected an invertible observation matrix, got states that look alike"),
+    ):
+        with refuses(words):
+            belief.load(checkpoints / "neural_belief", **GRID, kind="neural+sensor", model=model)
 
 
 def test_an_impossible_frame_names_its_world() -> None:
@@ -326,7 +287,7 @@ def test_an_impossible_frame_names_its_world() -> None:
         many.correct(np.array([[[0, 255]], [[255, 2]]], np.uint8))
     for n, words in (
         (3, "worlds 0, 2: frame"),
-        (20, r"worlds 0, 2, 4, 6, 8, 10, 12, 14 and 2 more: "),
+        (200, r"worlds 0, 2, 4, .*, 196, 198: frame"),
     ):
         several = belief.known(sharp, prior=prior, n_worlds=n)
         frames = np.full((n, 1, 2), 255, np.uint8)

@@ -85,6 +85,11 @@ def test_models_with_equal_contents_are_equal() -> None:
     assert model != "wildfire"
 
 
+def test_files_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    model = read(tmp_path, WILDFIRE.replace("\n", "\r\n").encode("utf-8-sig"))
+    assert model == Model.wildfire() and not model.toml.startswith("\ufeff")
+
+
 def test_invalid_models_are_refused_with_the_servers_error(tmp_path: Path) -> None:
     path = tmp_path / "model.toml"
     path.write_text(changed("initial = 0.99", "initial = 0.5"))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from environments import LIVELY, RECORDED, WILDFIRE, make, serving
 from failures import refuses
-from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, netcdf
+from rasters import geotiff
 
 import emberwatch
 from emberwatch.model import Model
@@ -76,48 +76,22 @@ def test_worlds_load_from_any_folder_in_any_locale(tmp_path: Path) -> None:
             assert "/fire \\xe9/none.npz: No such file" in out
 
 
-#: Calls the importer with each group of arguments.
-IMPORT = """
-import sys
-from itertools import groupby
-from emberwatch.landscape.__main__ import main
-for is_end, words in groupby(sys.argv[1:], "//".__eq__):
-    if is_end:
-        continue
-    try: code = main([*words]) or 0
-    except SystemExit as ended: code = ended.code
-    print("\\n", code, "//", flush=True)
-    print("//", file=sys.stderr, flush=True)
-"""
-FLAGS = ("--kind=arrival", "--unit=min", "--step=10 min", "--burning=2", "--force", "--out")
-
-
-def imported(locale: dict[str, str], *files: tuple[Path, Path]) -> list[tuple[int, str, str]]:
-    calls = [word for file, out in files for word in (file, *FLAGS, out, "//")]
-    code, out, err = run(locale, "-c", IMPORT, *calls)
-    assert code == 0, err
-    told = [words.rpartition("\n ") for words in out.split(" //\n")[:-1]]
-    errors = err.split("//\n")
-    return [(int(it[2]), it[0], said) for it, said in zip(told, errors, strict=False)]
-
-
 @pytest.mark.parametrize("locale", [PLAIN, STRICT], ids=["plain", "strict"])
 def test_rasters_load_from_any_folder_in_any_locale(locale: dict[str, str], tmp_path: Path) -> None:
     folder, latin = tmp_path / "fire \xe9", tmp_path / LATIN
     folder.mkdir(), latin.mkdir()
-    np.save(folder / "a.npy", np.where(ARRIVAL == NEVER, np.inf, ARRIVAL))
-    geotiff(folder / "a.tif"), ascii_grid(folder / "a.asc"), netcdf(folder / "a.nc", at=ARRIVAL)
-    for name in ("a.tif", "a.nc"):
-        shutil.copy(folder / name, latin / name)
-    endings = "npy", "tif", "asc", "nc"
-    good = [(folder / f"a.{end}", folder / f"fire \xe9 {end}.npz") for end in endings]
-    bad = [(latin / "a.tif", latin / "b.npz"), (latin / "a.nc", latin / f"{LATIN}.npz")]
-    *told, plain, file, name = imported(locale, *good, (latin / "a.nc", latin / "a.npz"), *bad)
-    for (_, out), (code, said, err) in zip(good, told, strict=True):
-        assert (code, err) == (0, "") and str(out) in said
-        assert f'name = "{out.stem}"' in out.with_suffix(".toml").read_text("utf-8")
-    assert (plain[0], plain[2]) == (0, "")
-    for subject, (code, _, err) in (("file", file), ("--name", name)):
+    shutil.copy(geotiff(folder / "a.tif"), latin / "a.tif")
+    flags = "--kind=arrival", "--unit=min", "--step=10 min", "--burning=2", "--out"
+    command = "-m", "emberwatch.landscape"
+    out = folder / "fire \xe9.npz"
+    code, said, err = run(locale, *command, folder / "a.tif", *flags, out)
+    assert (code, err) == (0, "") and str(out) in said
+    assert f'name = "{out.stem}"' in out.with_suffix(".toml").read_text("utf-8")
+    for subject, file, out in (
+        ("file", latin / "a.tif", latin / "b.npz"),
+        ("--out", folder / "a.tif", latin / f"{LATIN}.npz"),
+    ):
+        code, _, err = run(locale, *command, file, *flags, out)
         (line,) = err.splitlines()
         assert (code, f": {subject}: {EXPECTED}" in line) == (2, True)
 

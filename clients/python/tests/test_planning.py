@@ -50,7 +50,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"airspace": Airspace(no_fly=np.zeros((5, 7), bool))}, r"no_fly: expected shape \(2, 2\)"),
     (
         {"airspace": Airspace(no_fly=np.array([[True, False], [False, False]]))},
-        "robots: expected cells where they may fly",
+        "robots: expected cells of a 2 x 2 grid where they may fly",
     ),
 ]
 

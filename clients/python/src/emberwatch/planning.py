@@ -45,8 +45,6 @@ def beam_search(
     n_moves = as_count(n_moves, "n_moves", 1, _native.MAX_MOVES)
     width = as_count(width, "width", 1, 65536)
     _check(given, cells, visited)
-    if airspace is not None and airspace.no_fly is not None:
-        _check_free(airspace.no_fly, cells, given.shape[1:])
     with np.errstate(over="ignore"):
         worth = given.astype(np.float32)
     if not np.isfinite(worth).all():
@@ -68,17 +66,5 @@ def _check(
     if robots.shape != (len(values), 2) or robots.dtype.kind not in "iu":
         got = f"{robots.dtype} of shape {robots.shape}"
         raise invalid("robots", f"integers of shape ({len(values)}, 2)", got)
-    if ((robots < 0) | (robots >= values.shape[1:])).any():
-        grid = f"{values.shape[1]} x {values.shape[2]}"
-        raise invalid("robots", f"cells of a {grid} grid", "cells outside it")
     if visited is not None and np.shape(visited) != values.shape:
         raise invalid("visited", f"shape {values.shape}", np.shape(visited))
-
-
-def _check_free(
-    no_fly: NDArray[np.bool_], robots: NDArray[np.integer], shape: tuple[int, ...]
-) -> None:
-    if no_fly.shape != shape:
-        raise invalid("airspace: no_fly", f"shape {shape}", no_fly.shape)
-    if no_fly[robots[:, 0], robots[:, 1]].any():
-        raise invalid("robots", "cells where they may fly", "a no-fly cell")

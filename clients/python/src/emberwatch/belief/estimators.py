@@ -6,14 +6,13 @@
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar, cast
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import emberwatch._native as _native
-from emberwatch.belief.prior import distribution
-from emberwatch.common.arguments import as_array, as_count, as_flag, as_integer
+from emberwatch.common.arguments import as_array, as_count, as_flag
 from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
@@ -73,7 +72,12 @@ def known(
         NotEnoughMemoryError: If beliefs about `n_worlds` worlds do not fit in memory.
     """
     model = Model.named(model)
-    numbers = distribution(prior, n_states=model.n_states).astype(np.float32)
+    expected = f"numbers of shape ({model.n_states}, H, W)"
+    given = as_array(prior, "prior", expected)
+    if given.ndim != 3 or len(given) != model.n_states or given.dtype.kind not in "fiu":
+        raise invalid("prior", expected, f"{given.dtype} of shape {given.shape}")
+    with np.errstate(over="ignore"):  # infinity is refused
+        numbers = given.astype(np.float32, order="C")
     return Belief(_native.Estimators.known(model.toml, numbers, kind, _n_worlds(n_worlds)))
 
 
@@ -141,9 +145,9 @@ class Belief:
     - `copy.copy`, `copy.deepcopy` and `pickle` make independent copies, as `copy` does. A pickle
       has everything that the belief needs: the model or the checkpoint, the first belief, and the
       state. An autoencoder's belief cannot be copied or saved: `InvalidArgumentError`.
-    - Signals such as Ctrl-C end every call about many worlds, between two worlds. The worlds of an
-      unfinished `correct` or `predict` then refuse all calls with an `EmberwatchError`, code
-      ``"interrupted"``, until `reset`.
+    - Signals such as Ctrl-C end every call about many worlds, between two worlds. After an
+      unfinished `correct` or `predict`, the belief refuses all calls with an `EmberwatchError`,
+      code ``"interrupted"``, until a `reset` of all worlds.
 
     Only one thread at a time may use a belief.
     """
@@ -155,10 +159,9 @@ class Belief:
 
     def __repr__(self) -> str:
         """Shows kind, shape, worlds and step: the number of predictions since the first belief."""
-        steps = set(self._native.steps())
-        known_steps = sorted(step for step in steps if step is not None)
-        ends = dict.fromkeys([*known_steps[:1], *known_steps[-1:]])
-        step = "unfinished" if None in steps else " to ".join(map(str, ends))
+        steps = self._native.steps()
+        ends = None if steps is None else dict.fromkeys((min(steps), max(steps)))
+        step = "unfinished" if ends is None else " to ".join(map(str, ends))
         return f"Belief({self.kind!r}, shape={self.shape}, worlds={self._shape[0]}, step={step})"
 
     def __copy__(self) -> "Belief":
@@ -291,7 +294,10 @@ class Belief:
         shape (n_worlds,). `states` has the shape and type of frames, and values below S. `target`
         is the value in `states` of the state that pays most; None: `target_state`.
         """
-        figures = self._native.scores(self._frames(states, "states"), target_of(self, target))
+        if target is None:
+            target = self.target_state
+        target = as_count(target, "target", 0, len(self.state_names) - 1)
+        figures = self._native.scores(self._frames(states, "states"), target)
         losses, briers, accuracies = (self._of_worlds(figure) for figure in figures)
         return losses, briers, accuracies
 
@@ -317,35 +323,16 @@ class Belief:
     def _chosen(self, worlds: ArrayLike | slice | None) -> NDArray[np.bool_]:
         """Returns the mask of the chosen worlds."""
         chosen = np.zeros(self._shape[0], np.bool_)
-        expected = (
-            f"a mask of {len(chosen)} worlds, indices from 0 to {len(chosen) - 1}, or a slice"
-        )
-        index = slice(None) if worlds is None else worlds
-        if not isinstance(index, slice):
-            index = as_array(index, "worlds", expected)
-            is_mask = index.dtype == np.bool_
-            if not index.size and not is_mask:
-                index = index.astype(np.intp)  # NumPy reads [] as float64
-            if index.ndim > 1 or (is_mask and index.shape != chosen.shape):
-                raise invalid("worlds", expected, repr_of(worlds))
         try:
-            chosen[index] = True
+            chosen[slice(None) if worlds is None else cast("Any", worlds)] = True
         except (IndexError, TypeError, ValueError):
+            n = len(chosen)
+            expected = f"a mask of {n} worlds, indices from 0 to {n - 1}, or a slice"
             raise invalid("worlds", expected, repr_of(worlds)) from None
         return chosen
 
     def _of_worlds(self, values: NDArray[_Number]) -> NDArray[_Number]:
         return values[0] if self._is_single else values
-
-
-def target_of(belief: Belief, target: int | None) -> int:
-    """Checks the index of a target state; None stands for the belief's `target_state`."""
-    names = belief.state_names
-    number = belief.target_state if target is None else as_integer(target)
-    if number is not None and not isinstance(target, bool) and 0 <= number < len(names):
-        return number
-    expected = f"an integer within 0 to {len(names) - 1} ({', '.join(names)})"
-    raise invalid("target", expected, repr_of(target))
 
 
 def _n_worlds(n_worlds: int | None) -> int | None:

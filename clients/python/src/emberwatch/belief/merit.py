@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import emberwatch._native as _native
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Merit:
     """The figures of one run. A figure is None if there was nothing to measure."""
 
@@ -60,11 +60,4 @@ class MeritTally:
 
     def merit(self, world: int) -> Merit:
         """Returns the figures of one world's steps so far."""
-        detected, n_burning, seen, distance, grid_seen = self._tally.merit(world)
-        return Merit(
-            steps_to_detection=detected,
-            burning_cells_at_detection=n_burning,
-            burning_seen_share=seen,
-            front_distance=distance,
-            grid_seen_share=grid_seen,
-        )
+        return Merit(*self._tally.merit(world))

@@ -14,10 +14,6 @@ from emberwatch.model import Model
 PriorKind = Literal["simulated", "initial", "uniform"]
 """The name of a prior, see `wrappers.BeliefObservation`."""
 
-# Tolerance for the sum of a cell's probabilities, as in the Rust agent: the error of 400 float32
-# roundings.
-_SUM_TOLERANCE = 5e-5
-
 
 def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
     """Returns the model's initial distribution, before the burn-in, in each cell; (S, H, W)."""
@@ -27,28 +23,6 @@ def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float6
 def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
     """Returns equal probabilities of all states, (S, H, W), as in the paper's demonstration."""
     return np.full((model.n_states, height, width), 1.0 / model.n_states)
-
-
-def distribution(prior: ArrayLike, *, n_states: int) -> NDArray[np.float64]:
-    """Checks that a prior has shape (S, H, W) and is a distribution in each cell.
-
-    Returns a copy in double precision.
-    """
-    expected = f"numbers of shape ({n_states}, H, W)"
-    given = as_array(prior, "prior", expected)
-    fits = given.ndim == 3 and given.shape[0] == n_states and given.size > 0
-    if not fits or given.dtype.kind not in "fiu":
-        got = repr_of(prior) if given.ndim == 0 else f"{given.dtype} of shape {given.shape}"
-        raise invalid("prior", expected, got)
-    with np.errstate(all="ignore"):  # an overflow is refused below
-        belief = np.array(given, np.float64, order="C")
-        is_one = np.abs(belief.sum(axis=0) - 1.0) <= _SUM_TOLERANCE
-    fine = is_one & (belief >= 0.0).all(axis=0)
-    if not fine.all():
-        row, col = (int(i) for i in np.argwhere(~fine)[0])
-        got = belief[:, row, col].tolist()
-        raise invalid(f"prior: cell ({row}, {col})", "probabilities >= 0 with sum 1", got)
-    return belief
 
 
 @functools.lru_cache(maxsize=8)

@@ -1,15 +1,13 @@
 """Scores of a belief on recorded sequences of frames and hidden states."""
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief.estimators import Belief, target_of
-from emberwatch.common.arguments import as_array
-from emberwatch.common.codes import UNOBSERVED
-from emberwatch.errors import invalid, repr_of
+from emberwatch.belief.estimators import Belief
+from emberwatch.errors import invalid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,19 +71,15 @@ def score(
 
     Raises:
         InvalidArgumentError: If an array does not have the belief's shape, type or values, or
-            `target` is not a state. The belief does not change.
+            `target` is not a state. The belief is then at the step before.
         EmberwatchError: Code ``"impossible_frame"``, if a frame has probability 0 under the belief.
     """
-    if not isinstance(cast("object", belief), Belief):
-        raise invalid("belief", "a Belief of `known` or `load`", repr_of(belief))
-    frames = _sequence(observations, "observations", belief, belief.n_observations)
-    truths = _sequence(states, "states", belief, len(belief.state_names))
-    if len(truths) != len(frames):
-        raise invalid("states", f"{len(frames)} steps, as in observations", len(truths))
-    target = target_of(belief, target)
+    if not 0 < len(observations) == len(states):
+        expected = f"{len(observations)} steps, as in observations, at least 1"
+        raise invalid("states", expected, len(states))
     belief.reset(keep_correlations=keep_correlations)
     rows = list[tuple[Any, ...]]()
-    for frame, truth in zip(frames, truths, strict=True):
+    for frame, truth in zip(observations, states, strict=True):
         predicted = belief.score_frames(frame)
         belief.correct(frame)
         rows.append((*predicted, *belief.score_states(truth, target=target)))
@@ -105,23 +99,3 @@ def score(
 def _per_cell(sums: NDArray[np.float64], n_seen: NDArray[Any]) -> NDArray[np.float64]:
     """Divides sums by numbers of seen cells; NaN where no cell was seen."""
     return np.where(n_seen > 0, sums / np.maximum(n_seen, 1), np.nan)
-
-
-def _sequence(
-    values: NDArray[np.uint8], name: str, belief: Belief, n_values: int
-) -> NDArray[np.uint8]:
-    """Checks the frames, or the hidden states, of K steps."""
-    shape = ", ".join(map(str, belief.shape))
-    expected = f"shape (K, {shape}) with K >= 1, and type uint8"
-    given = as_array(values, name, expected)
-    if given.shape[1:] != belief.shape or not given.size or given.dtype != np.uint8:
-        raise invalid(name, expected, f"{given.shape} and {given.dtype}")
-    is_wrong, unless = given >= n_values, ""
-    if name == "observations":
-        is_wrong &= given != UNOBSERVED
-        unless = f", or {UNOBSERVED}"
-    if is_wrong.any():
-        step, *cell = (int(i) for i in np.argwhere(is_wrong)[0])
-        where = f"{name}: step {step}, cell {tuple(cell[-2:])}"
-        raise invalid(where, f"a value below {n_values}{unless}", given[(step, *cell)])
-    return given

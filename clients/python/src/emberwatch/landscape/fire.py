@@ -7,24 +7,16 @@ state of each cell in each step.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.landscape.grid import (
-    Place,
-    Rule,
-    check_same,
-    check_square,
-    of_world,
-    resampled,
-    target_shape,
-)
-from emberwatch.landscape.layers import Layer, check_full, where
-from emberwatch.landscape.schedule import SECONDS, Time, schedule, steps_at, unit_of
+from emberwatch.landscape.grid import check_same, check_square, resampled, target_shape
+from emberwatch.landscape.layers import Layer, where
+from emberwatch.landscape.times import SECONDS, date, schedule, steps_at, unit_of
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 
@@ -32,10 +24,8 @@ Kind = Literal["arrival", "mask", "burning", "states"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 
 MOST_STATES: Final = 1 << 31  # maximum size of a sequence, bytes
-#: Numbers below 0 that files use for "no value", and the number below which all others are, too.
+#: Numbers below 0 that files use for "no value".
 _CODES: Final = (-1, -9, -99, -999, -9999, -99999, -32767, -32768, -2147483647, -2147483648)
-_LEAST: Final = -1e18
-_LAST_DAY, _HALF_YEAR = 366, 180  # days
 
 
 class Times(NamedTuple):
@@ -47,12 +37,11 @@ class Times(NamedTuple):
     arrival: NDArray[np.float64]
     burnt: NDArray[np.float64]
     n_steps: int
-    place: Place
     name: str
     """Name of the first layer, for errors."""
-    begin: str | None = None
+    begin: str | None
     """The date of step 0, if the files have it."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
     """What was assumed about the input."""
 
 
@@ -63,19 +52,14 @@ class Meaning:
     kind: Kind
     seconds: float
     """Duration of a step."""
-    unit: str | None = None
-    begin: float | None = None
-    year_days: int | None = None
-    burning: int = 1
-    every: int = 1
-    codes: tuple[float, float, float] = (UNBURNT, BURNING, BURNT)
-    oblong: bool = False
-    missing_is_unburnt: bool = False
-    height: int | None = None
-    width: int | None = None
-    cell: float | None = None
-    """Side of the world's cells in metres, instead of `height` and `width`."""
-    resample: Rule = "earliest"
+    unit: str | None
+    begin: float | None
+    burning: int
+    codes: tuple[float, ...]
+    oblong: bool
+    height: int | None
+    cell: float | None
+    """Side of the world's cells in metres, instead of `height`."""
 
 
 def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
@@ -87,14 +71,14 @@ def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
 
 def states(fire: Times) -> NDArray[np.uint8]:
     """Computes the states of a fire in each step, shape (K, H, W)."""
-    height, width = fire.place.shape
+    height, width = fire.arrival.shape
     if fire.n_steps < 2:
         got = f"{fire.n_steps}: all cells that burn begin in it"
         remedy = "use a shorter --step, or merge the files of one fire (ogrmerge.py -single)"
         raise invalid(fire.name, "at least 2 steps", f"{got}; {remedy}")
     if fire.n_steps * height * width > MOST_STATES:
         got = f"{fire.n_steps} steps of {height} x {width} cells"
-        remedy = "use a longer --step or --every, or a smaller grid"
+        remedy = "use a longer --step, or a smaller grid"
         raise invalid(fire.name, f"at most {MOST_STATES} bytes of states", f"{got}; {remedy}")
     sequence = np.empty((fire.n_steps, height, width), np.uint8)
     for k, step in enumerate(sequence):
@@ -106,41 +90,38 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     layer = layers[0]
     if len(layers) != 1:
         raise invalid(layer.name, "one band of arrival times", f"{len(layers)}; choose with --band")
-    arrival = layer.values
-    burns = np.isfinite(arrival)
-    arrival[~burns] = np.inf
-    _check_negative(layer, meaning)
-    if not burns.any():
+    values = layer.values.astype(np.float64)
+    arrival = np.where(np.isfinite(values), values, np.inf)
+    if np.isinf(arrival).all():
         raise invalid(layer.name, "cells that burn", "none")
-    unit = unit_of(layer.clock, meaning.unit, layer.name)
+    _check_negative(layer, meaning)
+    unit = unit_of(layer.unit, meaning.unit, layer.name)
     if unit is None:
         expected = f"ms, s, min, h or d, as {layer.name} does not state the unit of times"
         raise invalid("--unit", expected, "none")
-    notes = layer.notes + _over_new_year(arrival, unit, layer.name, meaning)
-    latest = np.max(arrival, where=burns, initial=-np.inf)
     begin = float(arrival.min()) if meaning.begin is None else meaning.begin
-    rounding = float(np.spacing(np.array(latest, layer.stored))) if layer.stored.kind == "f" else 0
-    place, first, last = _on_world(arrival, arrival, layer, meaning)
+    latest = float(arrival[np.isfinite(arrival)].max())
+    first, last = _on_world(arrival, arrival, layer, meaning)
     moments = np.unique(first[np.isfinite(first)])
     # A step shows the fire at the step's time, so a cell that begins to burn later first burns in
     # the next step.
-    first, last, latest = (
-        steps_at(
-            np.maximum(np.asarray(at, np.float64), begin) - begin,
-            meaning.seconds / SECONDS[unit],
-            rounding,
-            layer.name,
-        )
-        for at in (first, last, latest)
+    first, last, end = (
+        steps_at(np.maximum(at, begin) - begin, meaning.seconds / SECONDS[unit])
+        for at in (first, last, np.array([latest]))
     )
-    date = layer.clock.date(begin * SECONDS[unit])
     since, until = (
-        layer.clock.date(at * SECONDS[unit]) or f"{at:.13g} {unit}" for at in moments[[0, -1]]
+        date(at * SECONDS[unit], layer.unit) or f"{at:.13g} {unit}" for at in moments[[0, -1]]
     )
-    n_steps, n_lit = int(latest) + 1, len(np.unique(first[np.isfinite(first)]))
+    n_steps, n_lit = int(end[0]) + 1, len(np.unique(first[np.isfinite(first)]))
     words = f"cells begin to burn at {len(moments)} times from {since} to {until}"
-    notes = (*notes, f"{words}, in {n_lit} of {n_steps} steps")
-    return Times(first, last + meaning.burning, n_steps, place, layer.name, date, notes)
+    return Times(
+        arrival=first,
+        burnt=last + meaning.burning,
+        n_steps=n_steps,
+        name=layer.name,
+        begin=date(begin, layer.unit),
+        notes=(*layer.notes, f"{words}, in {n_lit} of {n_steps} steps"),
+    )
 
 
 def _check_negative(layer: Layer, meaning: Meaning) -> None:
@@ -148,54 +129,28 @@ def _check_negative(layer: Layer, meaning: Meaning) -> None:
 
     Even then, refuses the usual codes for "no value".
     """
-    negative = layer.values < 0
-    if negative.any() and meaning.begin is not None and np.isinf(layer.values).any():
-        negative &= np.isin(layer.values, _CODES) | (layer.values < _LEAST)
-    # If every cell has a time, a negative time may mean that the cell never burns.
+    negative = np.isfinite(layer.values) & (layer.values < 0)
+    if meaning.begin is not None:
+        negative &= np.isin(layer.values, _CODES)
     if negative.any():
         remedy = "if it means never, give --nodata; if the cell burnt before, --begin 0"
         raise invalid(layer.name, "times of at least 0", f"{_first(layer, negative)}; {remedy}")
 
 
-def _over_new_year(
-    arrival: NDArray[np.floating[Any]], unit: str, name: str, meaning: Meaning
-) -> tuple[str, ...]:
-    """Moves days of the year after New Year to the next year, or notes that there may be some."""
-    finite = arrival[np.isfinite(arrival)] if unit == "d" else np.zeros(1)
-    is_of_year = unit == "d" and 0 <= finite.min() and finite.max() < _LAST_DAY + 1
-    if meaning.year_days is not None and not is_of_year:
-        got = f"{finite.min():g} to {finite.max():g}" if unit == "d" else f"the unit {unit}"
-        raise invalid("--year-days", f"days 0 to {_LAST_DAY} in {name}", got)
-    days = np.unique(np.floor(finite))
-    gaps = np.diff(days)
-    if not is_of_year or not gaps.size or gaps.max() < _HALF_YEAR:
-        return ()
-    last, following = days[gaps.argmax() :][:2]
-    if meaning.year_days is None:
-        words = f"no cell begins to burn between days {last:g} and {following:g}"
-        return (f"{words}; if these are days of the year, give --year-days 365 (or 366)",)
-    arrival[arrival < following] += meaning.year_days
-    return (
-        f"days {days[0]:g} to {last:g} follow New Year, and days {following:g} to {days[-1]:g}",
-    )
-
-
 def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
-    first = None
-    state, mark = np.empty(0, np.uint8), math.nan
-    arrival = burnt = np.empty(0, np.float32)  # numbers of layers
-    names, stamps = list[str](), list[Time]()
-    codes = meaning.codes if meaning.kind == "states" else (0.0,)
+    read = list[Layer]()
+    state, mark, n_missing = np.empty(0, np.uint8), math.nan, 0
+    arrival = burnt = np.empty(0)  # numbers of layers
+    unburnt = meaning.codes[UNBURNT] if meaning.kind == "states" else 0.0
     for k, layer in enumerate(layers):
-        if first is None:
-            first, state = layer, np.zeros(layer.place.shape, np.uint8)
-            arrival, burnt = np.full((2, *state.shape), np.inf, np.float32)
-        check_same(layer.place, layer.name, first.place, first.name)
-        names.append(layer.name)
-        stamps += [layer.time] if layer.time else []
-        if not meaning.missing_is_unburnt:
-            check_full(layer, "a value in each cell", "--missing-is-unburnt treats them as unburnt")
-        layer.values[np.isnan(layer.values)] = codes[0]
+        if not read:
+            state = np.zeros(layer.place.shape, np.uint8)
+            arrival, burnt = np.full((2, *state.shape), np.inf)
+        read.append(replace(layer, values=np.empty(0)))  # without its memory
+        check_same(layer.place, layer.name, read[0].place, read[0].name)
+        missing = np.isnan(layer.values)
+        n_missing += np.count_nonzero(missing)
+        layer.values[missing] = unburnt
         if meaning.kind == "states":
             now = _coded(layer, meaning)
         else:
@@ -204,40 +159,37 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
         state = now
         arrival[(state >= BURNING) & np.isinf(arrival)] = k
         burnt[(state == BURNT) & np.isinf(burnt)] = k
-    if first is None:
-        raise invalid("layers", "at least 2", "none")
-    step, every, unit = meaning.seconds, meaning.every, meaning.unit
-    times = schedule(names, stamps, step=step, every=every, unit=unit)
+    first = read[0]
+    steps = schedule(read, step=meaning.seconds, unit=meaning.unit)
     if np.isinf(arrival).all():
         raise invalid(first.name, "cells that burn", "none")
     is_mask = meaning.kind == "mask"
-    place, *both = _on_world(arrival, arrival if is_mask else burnt, first, meaning)
-    arrival, burnt = (_at(one, times.steps) for one in both)
-    n_steps = int(times.steps[-1]) + 1
-    burnt = burnt + meaning.burning if is_mask else burnt
-    return Times(arrival, burnt, n_steps, place, first.name, times.begin)
+    both = _on_world(arrival, arrival if is_mask else burnt, first, meaning)
+    arrival, burnt = (_at(one, steps) for one in both)
+    note = f"{n_missing} cells of layers have no value, and count as unburnt"
+    return Times(
+        arrival=arrival,
+        burnt=burnt + meaning.burning if is_mask else burnt,
+        n_steps=int(steps[-1]) + 1,
+        name=first.name,
+        begin=None if first.time is None else date(first.time, first.time_unit),
+        notes=(note,) if n_missing else (),
+    )
 
 
 def _on_world(
     arrival: NDArray[Any], burnt: NDArray[Any], layer: Layer, meaning: Meaning
-) -> tuple[Place, NDArray[Any], NDArray[Any]]:
-    """Returns the world's grid, and both times of each cell resampled to it."""
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Returns both times of each cell, resampled to the world's grid."""
     if not meaning.oblong:
         check_square(layer.place, layer.name)
-    height, width, cell = meaning.height, meaning.width, meaning.cell
-    shape = target_shape(layer.place, height=height, width=width, cell=cell)
-    place = of_world(layer.place, shape)
+    shape = target_shape(layer.place, height=meaning.height, cell=meaning.cell)
     if shape == arrival.shape:
-        return place, arrival, burnt
+        return arrival, burnt
     # A larger cell is burnt once all of its input cells that ever burn are burnt.
     last = np.where(np.isfinite(arrival), burnt, -np.inf)
-    last = resampled(last, shape, meaning.resample, latest=True)
-    first = resampled(arrival, shape, meaning.resample)
-    burns = np.isfinite(first)
-    if not burns.any():
-        grid = f"the grid of {shape[0]} x {shape[1]} cells"
-        raise InvalidArgumentError(f"--resample: no cell burns on {grid}; use 'earliest'")
-    return place, first, np.where(burns, last, np.inf)
+    last, first = resampled(last, shape, latest=True), resampled(arrival, shape)
+    return first, np.where(np.isfinite(first), last, np.inf)
 
 
 def _coded(layer: Layer, meaning: Meaning) -> NDArray[np.uint8]:
@@ -259,13 +211,11 @@ def _marked(
     burning = layer.values != 0
     if math.isnan(mark) and burning.any():
         mark = float(layer.values[burning][0])
-    if mark < 0:
-        got = f"{_first(layer, burning)}; if it means no value, give --nodata"
-        raise invalid(layer.name, "0 and a number above 0", got)
-    wrong = burning & (layer.values != mark)
+    wrong = burning & ((layer.values != mark) | (layer.values < 0))
     if wrong.any():
-        expected = f"0 and only one other number in all layers, {mark:.6g}"
-        raise InvalidArgumentError(f"{layer.name}: expected {expected}, got {_first(layer, wrong)}")
+        remedy = "if it means no value, give --nodata"
+        expected = "0 and only one other number, above 0, in all layers"
+        raise invalid(layer.name, expected, f"{_first(layer, wrong)}; {remedy}")
     now = burning.astype(np.uint8)
     if meaning.kind == "burning":
         now[~burning & (before >= BURNING)] = BURNT

@@ -1,9 +1,7 @@
-"""Flags that both commands have, and types of the values of flags."""
+"""Flags that both commands have."""
 
 import argparse
-from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, NoReturn
+from typing import NoReturn
 
 
 class Parser(argparse.ArgumentParser):
@@ -20,13 +18,8 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     add("--variable", metavar="NAME", help="the variable or layer, if a file has several")
     add("--band", type=whole, metavar="N", help="the only band to read from each file [all]")
     add("--nodata", type=float, action="append", metavar="X", help="a number that means no value")
-    add("--name", help="name in the output [the output file's]")
+    add("--oblong", action="store_true", help="allow cells that are not square on the ground")
     add("--force", action="store_true", help="replace the output")
-
-
-def of_flags(kind: Any, flags: argparse.Namespace) -> Any:
-    """Returns a dataclass with the values of the flags that have the names of its fields."""
-    return kind(**{field.name: getattr(flags, field.name) for field in fields(kind)})
 
 
 def whole(text: str) -> int:
@@ -37,16 +30,12 @@ def whole(text: str) -> int:
     return number
 
 
-def several(kind: type, words: str, is_right: Callable[[Any], bool]) -> Callable[[str], Any]:
-    """Returns a parser of numbers with commas between them; `words` says which are right."""
-
-    def parse(text: str) -> Any:
-        try:
-            numbers = tuple(kind(part) for part in text.split(","))
-        except ValueError:
-            numbers = ()
-        if not numbers or not is_right(numbers):
-            raise argparse.ArgumentTypeError(f"expected {words}, got {text}")
-        return numbers
-
-    return parse
+def metres(text: str) -> float:
+    """Parses a side of cells."""
+    try:
+        side = float(text)
+    except ValueError:
+        side = 0.0
+    if not 1e-3 <= side < 1e9:
+        raise argparse.ArgumentTypeError(f"expected at least 0.001 metres, got {text}")
+    return side

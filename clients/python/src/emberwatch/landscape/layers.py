@@ -3,18 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
-from emberwatch.landscape.grid import Place, crop
-from emberwatch.landscape.schedule import Clock, Time
+from emberwatch.landscape.grid import Place
 
-MOST_CELLS: Final = 1 << 28  # maximum number of used cells of a layer: 1 GiB of 32-bit numbers
-_STRIP: Final = 1 << 22  # number of cells that are read at once
-_ROUNDED: Final = float(np.finfo(np.float32).eps)  # relative tolerance for `nodata` numbers
+SINCE_1970: Final = "seconds since 1970-01-01"
+"""The unit of dates. Readers convert dates to this unit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,8 +21,7 @@ class Choice:
 
     variable: str | None = None
     band: int | None = None
-    nodata: tuple[float, ...] = ()
-    crop: tuple[int, ...] | None = None
+    nodata: Sequence[float] = ()
     cell: float | None = None
     """Side of the cells that perimeters and detections are drawn on, metres; None: refuse these."""
     time_column: str | None = None
@@ -39,36 +36,14 @@ class Layer:
     values: NDArray[np.floating]
     """Shape (rows, columns), the first row in the north; NaN in cells without a value."""
     place: Place
-    clock: Clock = Clock()
-    """The unit of the values, if they are times."""
-    stored: np.dtype[Any] = np.dtype(np.float64)
-    """The type of the numbers in the file."""
-    time: Time | None = None
+    unit: str = ""
+    """The unit of the values, as the file writes it, or `SINCE_1970`."""
+    time: float | None = None
     """The time of the layer, if the file states it."""
+    time_unit: str = ""
+    """The unit of `time`, as the file writes it, or `SINCE_1970`."""
     notes: tuple[str, ...] = ()
     """What the reader assumed."""
-
-
-def window(
-    name: str, array: Any, place: Place, choice: Choice
-) -> tuple[NDArray[np.floating], Place]:
-    """Reads the chosen window of an array (rows, columns) whose first cell is the north-west one.
-
-    Returns the values, NaN for `choice.nodata`, and their grid. Reads strips of rows one by one.
-    """
-    (rows, columns), cut = crop(place, choice.crop)
-    height, width = cut.shape
-    if height * width > MOST_CELLS:
-        raise invalid(name, f"at most {MOST_CELLS} cells", f"{height} x {width}; use --crop")
-    values = np.empty(cut.shape, np.promote_types(array.dtype, np.float32))
-    strip = max(1, _STRIP // width)
-    for top in range(0, height, strip):
-        bottom = min(top + strip, height)
-        read = np.asarray(array[rows.start + top : rows.start + bottom, columns])
-        values[top:bottom] = read
-        for number in choice.nodata:
-            values[top:bottom][np.isclose(read, number, rtol=_ROUNDED, atol=0.0)] = np.nan
-    return values, cut
 
 
 def check_full(layer: Layer, expected: str, remedy: str) -> None:
@@ -87,20 +62,18 @@ def where(cells: NDArray[np.bool_]) -> str:
 
 def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str:
     """Returns the name of the wanted variable in a file, or of its only variable."""
-    if wanted is not None and wanted in names:
-        return wanted
     known = ", ".join(sorted(names)) or "none"
-    if wanted is not None:
+    if wanted is not None and wanted not in names:
         raise invalid("--variable", f"a variable of {file} ({known})", f"'{wanted}'")
-    if len(names) != 1:
+    if wanted is None and len(names) != 1:
         raise invalid(file, "one variable", f"{len(names)} ({known}); choose with --variable")
-    return names[0]
+    return wanted or names[0]
 
 
 def choose_bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
     """Returns the numbers of the bands to read, counted from 1."""
     if choice.band is None:
         return range(1, count + 1)
-    if not 1 <= choice.band <= count:
+    if choice.band > count:
         raise invalid("--band", f"1 to {count} for {file}", choice.band)
     return [choice.band]

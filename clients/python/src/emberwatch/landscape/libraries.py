@@ -6,11 +6,9 @@ from typing import Any
 from emberwatch.errors import InvalidArgumentError
 
 
-def library(name: str, subject: object) -> Any:
-    """Imports a module; for the error, `subject` names what needs it, such as a file."""
+def library(name: str) -> Any:
+    """Imports a module of a library; names the extra if the library is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise InvalidArgumentError(
-            f"{subject}: reading it needs {name}, got: {error}; pip install emberwatch[landscape]"
-        ) from None
+        raise InvalidArgumentError(f"{error}; pip install emberwatch[landscape]") from None

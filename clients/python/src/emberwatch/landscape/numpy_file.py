@@ -1,4 +1,4 @@
-"""Reader of NumPy files. A `.npy` file is mapped into memory; a `.npz` is read whole."""
+"""Reader of NumPy files, which are read whole."""
 
 from collections.abc import Generator
 from pathlib import Path
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import Place
-from emberwatch.landscape.layers import Choice, Layer, choose_bands, choose_variable, window
+from emberwatch.landscape.layers import Choice, Layer, choose_bands, choose_variable
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
@@ -19,22 +19,21 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
         shapes = "(rows, columns) or (layers, rows, columns)"
         raise invalid(file, f"numbers of shape {shapes}", f"{array.dtype} {array.shape}")
     array = array.reshape(-1, *array.shape[-2:])
-    place = Place(shape=(array.shape[1], array.shape[2]))
     for band in choose_bands(file, len(array), choice):
-        name = f"{file}, layer {band}" if len(array) > 1 else str(file)
-        values, cut = window(name, array[band - 1], place, choice)
-        yield Layer(name=name, values=values, place=cut, stored=array.dtype)
+        yield Layer(
+            name=f"{file}, layer {band}" if len(array) > 1 else str(file),
+            values=np.array(array[band - 1], np.promote_types(array.dtype, np.float32)),
+            place=Place(shape=(array.shape[1], array.shape[2])),
+        )
 
 
 def _array(file: Path, choice: Choice) -> NDArray[Any]:
     try:
         with file.open("rb") as opened:
-            if opened.peek(2)[:2] == b"PK":
-                with np.load(opened) as archive:
-                    name = choose_variable(file, archive.files, choice.variable)
-                    return np.asarray(archive[name])
-        loaded: NDArray[Any] = np.load(file, mmap_mode="r")
-        return loaded
+            loaded: Any = np.load(opened)
+            if hasattr(loaded, "files"):  # an archive
+                loaded = loaded[choose_variable(file, loaded.files, choice.variable)]
+            return loaded
     except InvalidArgumentError:
         raise
     except Exception as error:  # NumPy, zipfile, zlib and tokenize differ on damaged bytes

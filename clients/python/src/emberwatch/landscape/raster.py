@@ -1,91 +1,56 @@
-"""Reader of GeoTIFF and ESRI ASCII grids, which uses GDAL through rioxarray."""
+"""Reader of GeoTIFF and ESRI ASCII grids, which uses GDAL through rasterio."""
 
-import re
 import warnings
 from collections.abc import Generator, Sequence
-from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import LIKE, Place
-from emberwatch.landscape.layers import Choice, Layer, choose_bands, window
+from emberwatch.landscape.layers import Choice, Layer, choose_bands
 from emberwatch.landscape.libraries import library
-from emberwatch.landscape.schedule import Clock
-
-#: Descriptions of bands that say which cells of other bands are valid.
-_AUXILIARY: Final = re.compile(r"(?i)\b(alpha|(data|valid\w*|cloud) ?mask|quality|q[ac])\b")
-
-#: A header line of an ESRI ASCII grid.
-_HEADER: Final = re.compile(
-    rb"(?i)\s*(ncols|nrows|[xy]ll(corner|center)|cellsize|d[xy]|nodata_value)\s"
-)
 
 
 def read(file: Path, choice: Choice) -> Generator[Layer]:
     """Yields the bands of a file, which is closed after the last one."""
     is_ascii = file.suffix.lower() == ".asc"
     driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
-    rasterio, rioxarray = library("rasterio", file), library("rioxarray", file)
-    path = Path(utf8("file", file.absolute()))
+    rasterio, path = library("rasterio"), utf8("file", file.absolute())
     # GDAL warns about files without a position, which are valid; its other warnings do not help
     # users.
     with warnings.catch_warnings(action="ignore"):
         try:
-            with rasterio.open(path, driver=driver) as source, ExitStack() as stack:
-                place, (bands, alpha) = _place(file, source), _bands(file, source, choice)
-                if is_ascii:
-                    arrays = [_ascii(file, source)]
-                else:
-                    arrays = stack.enter_context(
-                        rioxarray.open_rasterio(
-                            path, mask_and_scale=True, decode_times=False, cache=False
-                        )
-                    )
-                for band in bands:
-                    name = f"{file}, band {band}" if source.count > 1 else str(file)
-                    array = _turned(arrays[band - 1], source.transform)
-                    values, cut = window(name, array, place, choice)
-                    if alpha:
-                        array = _turned(arrays[alpha - 1], source.transform)
-                        is_valid = window(name, array, place, replace(choice, nodata=()))[0] > 0
-                        values[~is_valid] = np.nan
+            with rasterio.open(path, driver=driver) as source:
+                place = _place(file, source)
+                for band in _bands(file, source, choice):
+                    # GDAL masks cells by numbers that mean "no value", masks and alpha bands.
+                    read = source.read(band, masked=True)
+                    values = read.astype(np.promote_types(read.dtype, np.float32)).filled(np.nan)
+                    values = values * source.scales[band - 1] + source.offsets[band - 1]
                     yield Layer(
-                        name=name,
-                        values=values,
-                        place=cut,
-                        clock=Clock(source.units[band - 1] or ""),
-                        stored=np.dtype("f8" if is_ascii else source.dtypes[band - 1]),
+                        name=f"{file}, band {band}" if source.count > 1 else str(file),
+                        values=_turned(values, source.transform),
+                        place=place,
+                        unit=source.units[band - 1] or "",
                     )
         except InvalidArgumentError:
             raise
-        except Exception as error:  # rasterio and rioxarray have no common base class
+        except Exception as error:  # rasterio's errors have no common base class
             words = error.__cause__ or error
             raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
 
 
-def _bands(file: Path, source: Any, choice: Choice) -> tuple[Sequence[int], int]:
-    """Returns the bands with values, and the alpha band, which is 0 in cells without; 0: none."""
-    if source.subdatasets:
-        pages = f"{len(source.subdatasets)} pages; make bands of them (gdal_merge.py -separate)"
-        raise invalid(file, "one image", pages)
+def _bands(file: Path, source: Any, choice: Choice) -> Sequence[int]:
+    """Returns the bands with values. GDAL takes the last of four bytes for an alpha band."""
     bands = choose_bands(file, source.count, choice)
-    if any(source.dtypes[band - 1].startswith("complex") for band in bands):
-        raise invalid(file, "real numbers", source.dtypes[bands[0] - 1])
-    kinds, labels = source.colorinterp, source.descriptions
-    alpha = [band for band in source.indexes if kinds[band - 1].name == "alpha"]
-    odd = alpha + [band for band in bands if _AUXILIARY.search(labels[band - 1] or "")]
-    if choice.band is None and odd and not (odd == alpha and len(bands) == 2):
-        remedy = f"choose with --band; if it is one, gdal_edit.py -colorinterp_{odd[0]} gray"
-        got = f"band {odd[0]}, '{labels[odd[0] - 1] or 'alpha'}'; {remedy}"
-        raise invalid(file, "bands of layers", got)
-    others = [band for band in bands if band not in alpha]
-    return (others, min(alpha, default=0)) if others else (bands, 0)
+    alpha = [band for band in bands if source.colorinterp[band - 1].name == "alpha"]
+    if alpha and choice.band is None:
+        remedy = f"choose with --band; if it is a layer, gdal_edit.py -colorinterp_{alpha[0]} gray"
+        raise invalid(file, "bands of layers", f"the alpha band {alpha[0]}; {remedy}")
+    return bands
 
 
 def _place(file: Path, source: Any) -> Place:
@@ -93,7 +58,7 @@ def _place(file: Path, source: Any) -> Place:
     (height, width), transform, crs = source.shape, source.transform, source.crs
     # Measured over the whole grid, because rotations by tiny angles are rounding errors.
     skewed = abs(transform.b) * height > LIKE * abs(transform.a)
-    if skewed or abs(transform.d) * width > LIKE * abs(transform.e) or source.gcps[0]:
+    if skewed or abs(transform.d) * width > LIKE * abs(transform.e):
         got = "a rotated grid; reproject it (gdalwarp -t_srs)"
         raise invalid(file, "rows from west to east", got)
     if transform.is_identity:
@@ -103,29 +68,12 @@ def _place(file: Path, source: Any) -> Place:
         shape=source.shape,
         corner=(min(transform.c, east), max(transform.f, south)),
         cell=(abs(transform.a), abs(transform.e)),
-        projection=crs.to_wkt() if crs else None,
+        crs=library("pyproj").CRS.from_wkt(crs.to_wkt()) if crs else None,
     )
 
 
-def _turned(array: Any, transform: Any) -> Any:
-    """Returns a band whose first row is in the north, and first column in the west."""
+def _turned(values: Any, transform: Any) -> Any:
+    """Returns values whose first row is in the north, and first column in the west."""
     if transform.is_identity:  # no position: the rows stay in their order
-        return array
-    return array[:: 1 if transform.e < 0 else -1, :: 1 if transform.a > 0 else -1]
-
-
-def _ascii(file: Path, source: Any) -> NDArray[np.float64]:
-    """Parses an ASCII grid. GDAL would accept too few or too many numbers, and read words as 0."""
-    with file.open("rb") as opened:
-        start = 0
-        while _HEADER.match(opened.readline()):
-            start = opened.tell()
-        opened.seek(start)
-        values = np.concatenate([np.array(line.split(), np.float64) for line in opened])
-    if values.size != source.height * source.width:
-        expected = f"{source.height * source.width} numbers for {source.height} x {source.width}"
-        raise invalid(file, f"{expected} cells", values.size)
-    if source.nodata is not None:  # compared as 32-bit numbers: the header may be rounded
-        with np.errstate(over="ignore"):
-            values[values.astype(np.float32) == np.float32(source.nodata)] = np.nan
-    return values.reshape(source.shape)
+        return values
+    return values[:: 1 if transform.e < 0 else -1, :: 1 if transform.a > 0 else -1]
