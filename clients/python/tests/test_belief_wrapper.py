@@ -74,10 +74,13 @@ def test_the_belief_follows_the_steps_of_the_world(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(stub, "reset", lambda **_: (frame, {"step": next(steps)}))
     monkeypatch.setattr(stub, "step", lambda _: (frame, 0.0, False, False, {"step": next(steps)}))
     env = BeliefObservation(stub)
-    with pytest.warns(UserWarning, match="joined at step 5, and the environment has no method"):
-        env.reset()
+    monkeypatch.setattr(stub, "past_frames", lambda: [frame[:, :, 0]] * 5, raising=False)
+    env.reset()
     expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
-    expected.correct(frame[:, :, 0])  # a stub has no earlier frames
+    for _ in range(5):
+        expected.correct(frame[:, :, 0])
+        expected.predict()
+    expected.correct(frame[:, :, 0])
     for n_predictions in (0, 1, 0, 3):
         env.step(None)
         for _ in range(n_predictions):

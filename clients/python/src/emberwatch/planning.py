@@ -41,44 +41,27 @@ def beam_search(
     Returns:
         The moves, shape (n, n_moves): 0 up, 1 down, 2 left, 3 right.
     """
-    given, cells = np.asarray(values), np.asarray(robots)
+    with np.errstate(over="ignore"):  # refused below, as infinity
+        given, cells = np.asarray(values, np.float32), np.asarray(robots)
     n_moves = as_count(n_moves, "n_moves", 1, _native.MAX_MOVES)
     width = as_count(width, "width", 1, 65536)
-    _check(given, cells, visited)
-    if airspace is not None and airspace.no_fly is not None:
-        _check_free(airspace.no_fly, cells, given.shape[1:])
-    with np.errstate(over="ignore"):
-        worth = given.astype(np.float32)
-    if not np.isfinite(worth).all():
-        raise invalid("values", "numbers that are finite in single precision", "larger ones")
-    if visited is not None:
-        worth[np.asarray(visited) != 0] = 0.0
-    keys = rng.integers(2**64, size=len(worth), dtype=np.uint64)
-    return _native.beam_search(worth, cells.astype(np.int64), keys, n_moves, width, airspace)
-
-
-def _check(
-    values: NDArray[np.floating],
-    robots: NDArray[np.integer],
-    visited: NDArray[np.generic] | None,
-) -> None:
-    if values.ndim != 3 or values.size == 0 or not np.isfinite(values).all():
-        got = f"shape {values.shape}" if values.ndim != 3 or values.size == 0 else "NaN or infinity"
+    if given.ndim != 3 or given.size == 0 or not np.isfinite(given).all():
+        got = f"shape {given.shape}" if given.ndim != 3 or given.size == 0 else "NaN or infinity"
         raise invalid("values", "finite numbers of shape (n, H, W), at least one", got)
-    if robots.shape != (len(values), 2) or robots.dtype.kind not in "iu":
-        got = f"{robots.dtype} of shape {robots.shape}"
-        raise invalid("robots", f"integers of shape ({len(values)}, 2)", got)
-    if ((robots < 0) | (robots >= values.shape[1:])).any():
-        grid = f"{values.shape[1]} x {values.shape[2]}"
-        raise invalid("robots", f"cells of a {grid} grid", "cells outside it")
-    if visited is not None and np.shape(visited) != values.shape:
-        raise invalid("visited", f"shape {values.shape}", np.shape(visited))
-
-
-def _check_free(
-    no_fly: NDArray[np.bool_], robots: NDArray[np.integer], shape: tuple[int, ...]
-) -> None:
-    if no_fly.shape != shape:
-        raise invalid("airspace: no_fly", f"shape {shape}", no_fly.shape)
-    if no_fly[robots[:, 0], robots[:, 1]].any():
-        raise invalid("robots", "cells where they may fly", "a no-fly cell")
+    grid = given.shape[1:]
+    if cells.shape != (len(given), 2) or cells.dtype.kind not in "iu":
+        got = f"{cells.dtype} of shape {cells.shape}"
+        raise invalid("robots", f"integers of shape ({len(given)}, 2)", got)
+    no_fly = None if airspace is None else airspace.no_fly
+    is_off = ((cells < 0) | (cells >= grid)).any(axis=1)
+    if not is_off.any() and no_fly is not None and no_fly.shape == grid:
+        is_off = no_fly[cells[:, 0], cells[:, 1]]
+    if is_off.any():
+        expected = f"cells of a {grid[0]} x {grid[1]} grid, where they may fly"
+        raise invalid("robots", expected, cells[is_off][0].tolist())
+    if visited is not None:
+        if np.shape(visited) != given.shape:
+            raise invalid("visited", f"shape {given.shape}", np.shape(visited))
+        given = np.where(np.asarray(visited) != 0, np.float32(0.0), given)
+    keys = rng.integers(2**64, size=len(given), dtype=np.uint64)
+    return _native.beam_search(given, cells.astype(np.int64), keys, n_moves, width, airspace)
