@@ -3,6 +3,7 @@
 import argparse
 
 from emberwatch._native import VERSION
+from emberwatch.common.output import end_with_reader
 
 
 def main() -> None:
@@ -18,4 +19,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    end_with_reader()
     main()
