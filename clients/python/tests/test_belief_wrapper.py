@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from emberwatch.belief import initial_prior, known, uniform_prior
+from emberwatch.belief import RECOMMENDED, initial_prior, known, uniform_prior
 from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Model
 from emberwatch.wrappers import BeliefObservation
@@ -50,13 +50,13 @@ class Stub(gymnasium.Env[Any, Any]):
 gymnasium.register("test/Stub-v0", entry_point=f"{__name__}:Stub")
 
 
-def test_a_reset_observes_the_prior_and_a_step_the_posterior() -> None:
+@pytest.mark.parametrize("kind", [None, "known"])
+def test_a_reset_observes_the_prior_and_a_step_the_posterior(kind: str | None) -> None:
     stub = Stub()
-    env = BeliefObservation(stub)
-    expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+    env = BeliefObservation(stub, kind=kind)
     for seed in (1, 2):
         observation, _ = env.reset(seed=seed)
-        expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+        expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID), kind=kind or RECOMMENDED)
         assert (observation == expected.belief).all()
         for _ in range(4):
             observation, *_ = env.step(env.action_space.sample())
@@ -117,13 +117,17 @@ def test_images_are_beliefs_as_bytes_channels_last() -> None:
     assert image.max() > 200
 
 
-def test_a_spec_makes_the_same_environment() -> None:
+def test_a_spec_makes_the_same_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stub, prior = gymnasium.make("test/Stub-v0"), uniform_prior(WILDFIRE, **GRID)
     env = BeliefObservation(stub, keep=True, dtype="uint8", prior=prior, model=WILDFIRE)
     again = gymnasium.make(env.spec)
     assert again.observation_space == env.observation_space
     assert (again.reset(seed=3)[0]["belief"] == env.reset(seed=3)[0]["belief"]).all()
-    named = BeliefObservation(gymnasium.make("test/Stub-v0"), prior="uniform")
+    (tmp_path / "mine.toml").write_text(WILDFIRE.toml)
+    monkeypatch.chdir(tmp_path)
+    made = gymnasium.make("test/Stub-v0", model=None)
+    named = BeliefObservation(made, prior="uniform", model="mine.toml")
+    monkeypatch.chdir("/")
     text = named.spec.to_json()
     remade = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(text))
     assert (remade.reset()[0] == named.reset()[0]).all()
@@ -167,18 +171,7 @@ def test_unsuitable_environments_are_refused() -> None:
         BeliefObservation(Stub()).step(None)
 
 
-def test_it_observes_other_kinds_of_belief(tmp_path: Path) -> None:
-    stub = Stub()
-    env = BeliefObservation(stub, kind="known")
-    expected = known(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID), kind="known")
-    for seed in (1, 2):
-        env.reset(seed=seed)
-        expected.reset()
-        for _ in range(4):
-            observation, *_ = env.step(None)
-            expected.predict()
-            expected.correct(stub.frame)
-            assert (observation == expected.belief).all()
+def test_it_observes_the_belief_of_a_checkpoint(tmp_path: Path) -> None:
     checkpoint = tmp_path / "checkpoint"
     golden = np.load(golden_options.FILE)
     checkpoint.write_bytes(golden["checkpoint neural_belief"].tobytes())
@@ -187,14 +180,3 @@ def test_it_observes_other_kinds_of_belief(tmp_path: Path) -> None:
     assert env.filter.kind == "neural" and env.step(None)[0] in env.observation_space
     with refuses("prior: expected None with a checkpoint"):
         BeliefObservation(Stub(), checkpoint=checkpoint, prior="uniform")
-
-
-def test_a_spec_keeps_absolute_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "mine.toml").write_text(WILDFIRE.toml)
-    monkeypatch.chdir(tmp_path)
-    env = BeliefObservation(gymnasium.make("test/Stub-v0"), model="mine.toml")
-    monkeypatch.chdir("/")
-    assert env.spec is not None
-    (wrapper,) = [it for it in env.spec.additional_wrappers if it.name == "BeliefObservation"]
-    assert wrapper.kwargs is not None
-    assert wrapper.kwargs["model"] == str(tmp_path / "mine.toml")

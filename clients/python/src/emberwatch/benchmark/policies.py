@@ -38,7 +38,9 @@ class Actor:
             raise invalid("env", expected, "one without")
         seen = shown.single_observation_space
         expected = getattr(policy, "observation_space", seen)
-        if _content(expected) != _content(seen):
+        # A loaded model no longer refers to its `VecNormalize`, but expects other observations.
+        is_normalized = getattr(policy, "get_vec_normalize_env", lambda: None)() is not None
+        if _content(expected) != _content(seen) or (is_normalized and shown is worlds):
             raise InvalidArgumentError(
                 f"policy: expected the observations that it was trained on, {expected}, got "
                 f"{seen}: pass the observation= of its training, and if the training wrapped its "
@@ -61,7 +63,8 @@ class Actor:
                 given["action_masks"] = np.asarray(self._worlds.action_masks(), np.bool_)
             actions, self._state = self._predict(seen, **given, deterministic=self._deterministic)
             self._starts = np.zeros_like(self._starts)
-        return np.array(as_array(actions, "policy", "actions"))  # a policy may reuse its array
+        # A copy, as a policy may reuse its array.
+        return np.array(as_array(actions, "policy", "actions, without a state"))
 
 
 def _content(space: Any) -> Any:

@@ -50,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             warnings.showwarning = _warn
             server, has_truth = _contents(flags.recording, flags.world)
             model = _model(flags.model, server)
+            if model is None:
+                _warn("no belief, as the recording has no model that fits; give --model")
             begin = None if model is None else partial(_begin, model, server)
             page = Page(server, model, world=flags.world, scale=flags.scale, has_truth=has_truth)
             _write(flags, page, scenes(recording.read(flags.recording, world=flags.world), begin))
@@ -108,28 +110,13 @@ def _contents(path: Path, world: int) -> tuple[ServerInfo, bool]:
 
 
 def _model(path: str | None, server: ServerInfo) -> Model | None:
-    """Returns the model of the file `path`, or without one the recorded model.
-
-    Warns and returns None if there is no recorded model, or it has a form of an earlier release.
-    """
+    """Returns the model of the file `path`, or without one the recorded model, if there is one."""
     if path is not None:
-        model = Model.named(path)
-        if model.n_observations != server.n_observations:
-            raise InvalidArgumentError(
-                f"--model: expected one with {server.n_observations} observations, as recorded, "
-                f"got {model.n_observations}"
-            )
-        return model
-    problem = "the server hid its model"
-    if server.recorded_world is not None:
-        problem = "recorded worlds have no model"
-    if server.model is not None:
-        try:
-            return Model.from_toml(server.model)
-        except InvalidArgumentError:
-            problem = "the model has a form of an earlier release"
-    _warn(f"the belief is left out, as {problem}; give --model")
-    return None
+        return Model.named(path)
+    try:
+        return None if server.model is None else Model.from_toml(server.model)
+    except InvalidArgumentError:  # it has a form of an earlier release
+        return None
 
 
 def _warn(warning: Warning | str, *_: object) -> None:
