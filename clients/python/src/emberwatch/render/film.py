@@ -132,8 +132,6 @@ def _begin(model: Model, server: ServerInfo, k: int) -> Belief:
 
 def _write(flags: argparse.Namespace, page: Page, scenes: Iterator[Scene]) -> None:
     """Draws the scenes and writes the file at once, so that no output is partial."""
-    from PIL.Image import Dither
-
     (width, height), out = page.size, flags.out
     most = _MOST_PIXELS // (width * height)
     pictures, last = list["Image"](), None
@@ -142,7 +140,9 @@ def _write(flags: argparse.Namespace, page: Page, scenes: Iterator[Scene]) -> No
         if flags.first <= last <= flags.last and (last - flags.first) % flags.every == 0:
             if len(pictures) == most:
                 raise invalid("--every, --scale", f"at most {most} pictures of this size", "more")
-            pictures.append(page.draw(scene))
+            picture = page.draw(scene)
+            # Bytes take less memory, and rarely change a colour: a picture seldom has 256.
+            pictures.append(picture.quantize() if flags.step is None else picture)
             if flags.step is not None:
                 break
     if not pictures:
@@ -154,16 +154,12 @@ def _write(flags: argparse.Namespace, page: Page, scenes: Iterator[Scene]) -> No
         if flags.step is not None:
             pictures[0].save(temporary, "PNG")
         else:
-            # The legend has all colours, so that the first picture's colours fit all pictures.
-            colors = pictures[0].quantize()
             millis = 10 * round(100 / flags.fps)  # GIF durations are multiples of 10 ms
-            colors.save(
+            pictures[0].save(
                 temporary,
                 "GIF",
                 save_all=True,
-                append_images=[
-                    it.quantize(palette=colors, dither=Dither.NONE) for it in pictures[1:]
-                ],
+                append_images=pictures[1:],
                 duration=[millis] * (len(pictures) - 1) + [max(millis, _PAUSE_MILLIS)],
                 loop=0,
                 optimize=True,  # stores only the changed part of each picture
