@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import io
 import math
-import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -131,8 +131,8 @@ def _begin(model: Model, server: ServerInfo, k: int) -> Belief:
 
 
 def _write(flags: argparse.Namespace, page: Page, scenes: Iterator[Scene]) -> None:
-    """Draws the scenes and writes the file at once, so that no output is partial."""
-    (width, height), out = page.size, flags.out
+    """Draws the scenes and writes the file."""
+    width, height = page.size
     most = _MOST_PIXELS // (width * height)
     pictures, last = list["Image"](), None
     for scene in scenes:
@@ -141,34 +141,31 @@ def _write(flags: argparse.Namespace, page: Page, scenes: Iterator[Scene]) -> No
             if len(pictures) == most:
                 raise invalid("--every, --scale", f"at most {most} pictures of this size", "more")
             picture = page.draw(scene)
-            # Bytes take less memory, and rarely change a colour: a picture seldom has 256.
+            # One byte a pixel. This changes colours only in pictures with more than 256.
             pictures.append(picture.quantize() if flags.step is None else picture)
             if flags.step is not None:
                 break
     if not pictures:
         expected = f"some of the recorded steps, of which the last is {last}"
         raise invalid("--step, --from, --to", expected, f"{flags.first} to {flags.last}")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        if flags.step is not None:
-            pictures[0].save(temporary, "PNG")
-        else:
-            millis = 10 * round(100 / flags.fps)  # GIF durations are multiples of 10 ms
-            pictures[0].save(
-                temporary,
-                "GIF",
-                save_all=True,
-                append_images=pictures[1:],
-                duration=[millis] * (len(pictures) - 1) + [max(millis, _PAUSE_MILLIS)],
-                loop=0,
-                optimize=True,  # stores only the changed part of each picture
-            )
-        os.replace(temporary, out)
-    finally:
-        temporary.unlink(missing_ok=True)
-    size = f"{width} x {height} pixels, {out.stat().st_size} bytes"
-    print(shown(f"{out}: {len(pictures)} pictures of {size}"))
+    content = io.BytesIO()
+    if flags.step is not None:
+        pictures[0].save(content, "PNG")
+    else:
+        millis = 10 * round(100 / flags.fps)  # GIF durations are multiples of 10 ms
+        pictures[0].save(
+            content,
+            "GIF",
+            save_all=True,
+            append_images=pictures[1:],
+            duration=[millis] * (len(pictures) - 1) + [max(millis, _PAUSE_MILLIS)],
+            loop=0,
+            optimize=True,  # stores only the changed part of each picture
+        )
+    flags.out.parent.mkdir(parents=True, exist_ok=True)
+    flags.out.write_bytes(content.getbuffer())
+    size = f"{width} x {height} pixels, {content.tell()} bytes"
+    print(shown(f"{flags.out}: {len(pictures)} pictures of {size}"))
 
 
 if __name__ == "__main__":
