@@ -100,10 +100,12 @@ class WildfireVecEnv(VecEnv):
         )
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
-        if method_name != "action_masks":
-            expected = "'action_masks', as all worlds share one environment"
-            raise invalid("env_method", expected, repr_of(method_name))
-        return list(self.get_attr(method_name)[0]()[self._get_indices(indices)])
+        if method_name == "render":  # in mode "human"
+            return list(self.get_images())
+        if method_name == "action_masks":
+            return list(self.get_attr(method_name)[0]()[self._get_indices(indices)])
+        expected = "'render' or 'action_masks', as all worlds share one environment"
+        raise invalid("env_method", expected, repr_of(method_name))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

@@ -1,6 +1,6 @@
 """The pages of a film: a row of pictures with titles and legends, drawn with Pillow."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import cast
 
@@ -30,7 +30,7 @@ _RAMP = "ffffd9 edf8b1 c7e9b4 7fcdbb 41b6c4 1d91c0 225ea8 253494 081d58".split()
 _TEXT = cast("ImageFont.FreeTypeFont", ImageFont.load_default(13))
 _TITLE = cast("ImageFont.FreeTypeFont", ImageFont.load_default(17))
 
-_Legend = Sequence[tuple[NDArray[np.uint8] | None, str]]
+_Legend = list[tuple[NDArray[np.uint8], str]]
 
 
 class Page:
@@ -91,7 +91,7 @@ class Page:
                 image.paste(Image.fromarray(pixels), (left, _TOP))
         return image
 
-    def _columns(self, states: Sequence[str]) -> Iterator[tuple[str, _Legend]]:
+    def _columns(self, states: tuple[str, ...]) -> Iterator[tuple[str, _Legend]]:
         """Yields the title and the legend of each panel."""
         palette = self._palette
         of_states = [(_swatch(it), name) for it, name in zip(palette.states, states, strict=False)]
@@ -99,35 +99,32 @@ class Page:
         seen = [(_swatch(color), name) for color, name in colors]
         if self._has_truth:
             yield "truth (hidden)", of_states
-            if palette.observations == palette.states and list(self._server.observations) == [
-                *states
-            ]:
+            if self._server.observations == states:
                 seen = []  # the legend of the hidden states names the same colours
         seen.append((_swatch(palette.unobserved), "not seen"))
-        no_fly = np.ones((4, 4), np.bool_)
         if self._server.airspace.no_fly is not None:
-            seen.append((_swatch(LIGHT, airspace=Airspace(no_fly=no_fly)), "no-fly"))
+            closed = Airspace(no_fly=np.ones((4, 4), np.bool_))
+            seen.append((_swatch(LIGHT, closed), "no-fly"))
         robot = Picture(frame=np.zeros((1, 1), np.uint8), palette=self._shades, robots=[(0, 0)])
         yield "seen in this step", [*seen, (rgb_array(robot, scale=_SWATCH), "robot")]
         if self._model is not None:
             levels = np.tile(np.arange(_SHADES, dtype=np.uint8), (4, 1))
             ramp = _framed(rgb_array(Picture(frame=levels, palette=self._shades), scale=3))
             fire = self._model.state_names[self._model.target_state]
-            yield f"belief: {fire}", [(None, "0"), (ramp, "1")]
-            most = f"{np.log(self._model.n_states):.2f} nats"
-            yield "entropy of the belief", [(None, "0"), (ramp, most)]
+            yield f"belief: {fire}", [(ramp, "0 to 1")]
+            most = np.log(self._model.n_states)
+            yield "entropy of the belief", [(ramp, f"0 to {most:.2f} nats")]
 
     def _draw_legend(self, image: Image.Image, at: tuple[int, int], legend: _Legend) -> int:
         """Draws the marks and names of a legend in one or more lines; returns its lower edge."""
         x, y = at
         for mark, name in legend:
-            width = (0 if mark is None else mark.shape[1] + 5) + _TEXT.getlength(name)
+            width = mark.shape[1] + 5 + _TEXT.getlength(name)
             if x > at[0] and x + width > at[0] + self._room:
                 x, y = at[0], y + _LINE
-            if mark is not None:
-                image.paste(Image.fromarray(mark), (int(x), y + (_LINE - len(mark)) // 2))
-            _write(image, (x + width - _TEXT.getlength(name), y + _LINE // 2), name)
-            x += width + (12 if mark is not None else 5)
+            image.paste(Image.fromarray(mark), (int(x), y + (_LINE - len(mark)) // 2))
+            _write(image, (x + mark.shape[1] + 5, y + _LINE // 2), name)
+            x += width + 12
         return y + _LINE
 
     def _pictures(self, scene: Scene) -> Iterator[Picture | None]:
