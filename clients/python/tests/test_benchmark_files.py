@@ -98,7 +98,7 @@ def test_a_suite_writes_a_file_for_each_task(tmp_path: Path) -> None:
     [
         ({"tasks": ["ash"]}, "task ash: No such file"),
         ({"worlds": 0}, "worlds: expected an integer within 1 to 4294967295, got 0"),
-        ({"policy": {"team": up}}, "policy: expected one for the task small, got team"),
+        ({"policy": {"team": up}}, "policy: expected one for the task small, got ..team"),
     ],
 )
 def test_a_suite_is_refused_before_it_runs(tmp_path: Path, changes: Any, problem: str) -> None:

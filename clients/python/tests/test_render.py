@@ -70,18 +70,8 @@ def test_the_path_is_a_line_that_ends_at_the_robot() -> None:
     assert (pixel(image, 40, 20), pixel(image, 20, 80)) == ROBOTS[:2]  # the lines between cells
 
 
-def test_small_visited_cells_are_tinted() -> None:
-    wide = np.full((2, 40), 255, np.uint8)
-    wide[0] = 2
-    image = draw(frame=wide, robots=[(1, 39)], paths=[PATH[:1], np.array([(0, 1)])], scale=2)
-    tinted, plain = pixel(image, 0, 0), pixel(image, 0, 6)
-    assert plain == FIRE
-    assert all(t > p for t, p in zip(tinted, plain, strict=True)) and tinted != WHITE
-
-
 def test_the_truth_is_drawn_to_the_right_or_below() -> None:
     image = draw(truth=TRUTH)
-    assert image.shape == (80, 120 + 8 + 120, 3)
     assert pixel(image, 5, 128 + 45) == LATENT and pixel(image, 5, 128 + 85) == FIRE
     assert pixel(image, 5, 124) == (0xB4, 0xB4, 0xB4)
     wide = np.zeros((2, 6), np.uint8)

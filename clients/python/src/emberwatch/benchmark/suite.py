@@ -48,7 +48,7 @@ def suite(
     chosen = [(absolute(source), Task.named(source)) for source in sources]
     lacking = [task.name for _, task in chosen if policies and task.name not in policies]
     if lacking:
-        raise invalid("policy", f"one for the task {lacking[0]}", ", ".join(policies or ()))
+        raise invalid("policy", f"one for the task {lacking[0]}", list(policies or ()))
     folder = Path(folder).absolute()
     return {
         task.name: evaluate(
