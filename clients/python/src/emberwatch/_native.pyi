@@ -588,7 +588,7 @@ class MeritTally:
         """Adds a step; shapes `(n, H, W)`, `(n, R, 2)`, `(n,)`, `(n,)` and `(n, H, W)`."""
 
     def merit(self, world: int) -> tuple[int | None, int | None, float | None, float | None, float]:
-        """Returns the fields of `Merit`."""
+        """Returns the figures of a row of the benchmark, from `steps_to_detection` on."""
 
 def choices(given: object, n_rows: int, n_choices: int) -> NDArray[np.uint8] | None:
     """Checks that each row has one integer below `n_choices`; returns the integers as bytes.

@@ -169,4 +169,5 @@ def _play(
             raise invalid("steps", f"at most {step}, the length of these episodes", steps)
         paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
         tally.add(worlds.results, paths, worlds.truths)
-    return tally.rows(seeds, {**columns, "worlds_fingerprint": fingerprint})
+    columns = {**columns, "worlds_fingerprint": fingerprint}
+    return [tally.row(world, world_seed=seed, **columns) for world, seed in enumerate(seeds)]
