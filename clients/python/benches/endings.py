@@ -8,13 +8,14 @@ from __future__ import annotations
 import os
 import select
 import signal
-import statistics
-import subprocess
 import threading
 import time
-import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+
+from race import server, spread
 
 import emberwatch
 from emberwatch.errors import ServerGoneError
@@ -26,96 +27,59 @@ PAUSE = 0.05
 
 TIMEOUT = 20.0
 
-Times = tuple[float, float]
+
+@contextmanager
+def stopped() -> Iterator[tuple[Callable[[], object], int]]:
+    """Yields a step that waits for a paused server, and the server's process ID."""
+    with (
+        server("--height=5", "--width=7", "--moves=6", "--burn-in=20") as (instance, pid),
+        emberwatch.connect(instance) as client,
+    ):
+        lease = client.acquire()
+        os.kill(pid, signal.SIGSTOP)
+        yield lambda: lease.step([3] * 6, timeout=TIMEOUT), pid
 
 
-class Stopped:
-    """A paused server, and a lease on its robot."""
-
-    def __init__(self) -> None:
-        instance = f"endings-{uuid.uuid4().hex}"
-        flags = [f"--instance={instance}", "--height=5", "--width=7", "--moves=6", "--burn-in=20"]
-        self.program = subprocess.Popen(["emberwatch-server", *flags])
-        self.client = emberwatch.connect(instance, wait=20)
-        self.lease = self.client.acquire()
-        os.kill(self.program.pid, signal.SIGSTOP)
-
-    def step(self) -> None:
-        """Waits for an answer that never comes."""
-        self.lease.step([3] * 6, timeout=TIMEOUT)
-
-    def close(self) -> None:
-        """Ends the server."""
-        self.program.kill()
-        self.program.wait()
-        self.client.close()
-
-
-def interrupted(call: Callable[[], object]) -> float:
-    """Returns the seconds from Ctrl-C to the end of a call."""
+def millis(call: Callable[[], object], end: Callable[[], None]) -> float:
+    """Returns the milliseconds from `end`, on another thread, to the end of a call."""
     sent: list[float] = []
 
-    def interrupt() -> None:
+    def later() -> None:
         time.sleep(PAUSE)
         sent.append(time.perf_counter())
-        os.kill(os.getpid(), signal.SIGINT)
+        end()
 
-    thread = threading.Thread(target=interrupt)
-    with suppress(KeyboardInterrupt):
+    thread = threading.Thread(target=later)
+    with suppress(KeyboardInterrupt, ServerGoneError):
         thread.start()
         call()
     seconds = time.perf_counter() - sent[0]
     thread.join()
-    return seconds
+    return 1e3 * seconds
 
 
-def interruption() -> Times:
-    """Measures the interruption of a step, and of `time.sleep`."""
-    server = Stopped()
-    times = interrupted(server.step), interrupted(lambda: time.sleep(TIMEOUT))
-    server.close()
-    return times
-
-
-def death() -> Times:
-    """Measures how soon a step and a pidfd notice a server's death."""
-    server = Stopped()
-    process = os.pidfd_open(server.program.pid)
-    seen: list[float] = []
-
-    def kill() -> None:
-        time.sleep(PAUSE)
-        seen.append(time.perf_counter())
-        os.kill(server.program.pid, signal.SIGKILL)
-        select.select([process], [], [])
-        seen.append(time.perf_counter())
-
-    thread = threading.Thread(target=kill)
-    thread.start()
-    with suppress(ServerGoneError):
-        server.step()
-    end = time.perf_counter()
-    thread.join()
-    os.close(process)
-    server.close()
-    return end - seen[0], seen[1] - seen[0]
-
-
-def report(what: str, measure: Callable[[], Times], peer: str) -> None:
-    """Prints the medians, the maximum, and the ratio of the medians."""
-    ours, theirs = zip(*(measure() for _ in range(N_ROUNDS)), strict=True)
-    median, other = statistics.median(ours), statistics.median(theirs)
-    print(
-        f"{what:32} p50 {median * 1e3:7.2f} max {max(ours) * 1e3:7.2f} ms, "
-        f"{median / other:.1f} times {peer}'s {other * 1e3:.2f} ms",
-        flush=True,
-    )
+def interrupt() -> None:
+    """Sends Ctrl-C to this process."""
+    os.kill(os.getpid(), signal.SIGINT)
 
 
 def main() -> None:
     """Prints all rows."""
-    report("Ctrl-C ends a waiting step", interruption, "time.sleep")
-    report("a killed server ends a step", death, "a pidfd")
+    found = defaultdict[str, list[float]](list)
+    for _ in range(N_ROUNDS):
+        with stopped() as (step, _pid):
+            found["Ctrl-C ends a waiting step"].append(millis(step, interrupt))
+        found["Ctrl-C ends time.sleep"].append(millis(partial(time.sleep, TIMEOUT), interrupt))
+        with stopped() as (step, pid):
+            kill = partial(os.kill, pid, signal.SIGKILL)
+            found["a killed server ends a step"].append(millis(step, kill))
+        with stopped() as (_step, pid):
+            process, kill = os.pidfd_open(pid), partial(os.kill, pid, signal.SIGKILL)
+            wait = partial(select.select, [process], [], [])
+            found["a killed server ends a pidfd"].append(millis(wait, kill))
+            os.close(process)
+    for name, times in found.items():
+        print(f"{name:32} {spread(times)} ms")
 
 
 if __name__ == "__main__":

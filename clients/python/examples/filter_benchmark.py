@@ -1,7 +1,6 @@
 """Scores filters on the forest fires of N. Haksar, J. Lorenzetti and M. Schwager (CDC 2019).
 
-    python filter_benchmark.py                          # on simulated fires
-    python filter_benchmark.py --fires fires-all.npz    # on recorded fires
+    python filter_benchmark.py ../tests/data/fires/*.npz
 
 25 x 25 trees are healthy, burning or burnt. A healthy tree ignites with probability
 1 - (1 - a)**f, where f of its four neighbours burn and a rises from .1 in the first column to .4 in
@@ -31,9 +30,7 @@ from emberwatch import belief
 from emberwatch.model import Model
 
 SIDE = 25
-HEALTHY, BURNING, BURNT = range(3)
 RATES = np.linspace(0.1, 0.4, SIDE)  # a: probability of ignition per burning neighbour, by column
-BURNS_ON = float(np.exp(-0.1))
 Fire = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # states and frames, both [K, 25, 25]
 
 
@@ -61,7 +58,7 @@ times = ["rate"]
 [[transitions]]
 from = "burning"
 to = "burnt"
-base = {1.0 - BURNS_ON}
+base = {1.0 - np.exp(-0.1)}
 """  # noqa: E501
 
 
@@ -73,56 +70,6 @@ def model() -> Model:
         path.write_text(MODEL)
         np.savez(path.with_name("forest.npz"), rate=rate)
         return Model.named(path)
-
-
-def burn(random: np.random.Generator) -> NDArray[np.uint8]:
-    """Simulates one fire until nothing burns; states of shape (K, 25, 25)."""
-    state = np.zeros((SIDE, SIDE), np.uint8)
-    state[11:15, 11:15] = BURNING
-    states = [state]
-    while (state == BURNING).any():
-        burning = np.pad(state == BURNING, 1).astype(int)
-        near = burning[:-2, 1:-1] + burning[2:, 1:-1] + burning[1:-1, :-2] + burning[1:-1, 2:]
-        ignites = random.random(state.shape) < 1.0 - (1.0 - RATES) ** near
-        burns_out = random.random(state.shape) > BURNS_ON
-        next_state = state.copy()
-        next_state[(state == HEALTHY) & ignites] = BURNING
-        next_state[(state == BURNING) & burns_out] = BURNT
-        states.append(state := next_state)
-    return np.stack(states)
-
-
-def observe(
-    states: NDArray[np.uint8], seen: NDArray[np.bool_], random: np.random.Generator
-) -> NDArray[np.uint8]:
-    """Returns frames that show the trees marked in `seen`."""
-    shown = (states + random.choice(3, states.shape, p=[0.9, 0.05, 0.05])) % 3
-    return np.where(seen, shown, 255).astype(np.uint8)
-
-
-def window(steps: int, random: np.random.Generator) -> NDArray[np.bool_]:
-    """Returns masks of the 9 x 9 trees that a camera sees as it flies between random points."""
-    seen = np.zeros((steps, SIDE, SIDE), bool)
-    at, goal = np.array([12, 12]), np.array([12, 12])
-    for step in range(steps):
-        while (at == goal).all():
-            goal = random.integers(4, SIDE - 4, 2)
-        at = at + np.sign(goal - at)
-        seen[step, at[0] - 4 : at[0] + 5, at[1] - 4 : at[1] + 5] = True
-    return seen
-
-
-def simulated(which: str, n_fires: int, seed: int) -> Iterator[Fire]:
-    """Simulates fires. `which` selects the observed trees: "all", "tenth" or "window"."""
-    for fire in range(n_fires):
-        random = np.random.default_rng([seed, fire])
-        states = burn(random)
-        seen = np.ones(states.shape, bool)
-        if which == "tenth":
-            seen = random.random(states.shape) < 0.1
-        elif which == "window":
-            seen = window(len(states), random)
-        yield states, observe(states, seen, random)
 
 
 def recorded(path: Path) -> Iterator[Fire]:
@@ -178,26 +125,17 @@ def run(it: belief.Belief, frames: NDArray[np.uint8]) -> None:
 
 
 def main() -> None:
-    """Scores filters of the known model on simulated or recorded fires."""
+    """Scores filters of the known model on recorded fires."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--fires", type=Path, action="append", help="file of recorded fires (.npz); repeatable"
-    )
-    parser.add_argument(
-        "--simulate", type=int, default=12, metavar="N", help="number of simulated fires"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the simulated fires")
+    parser.add_argument("fires", type=Path, nargs="+", help="files of recorded fires (.npz)")
     kinds = [name for name, kind in belief.kinds().items() if not kind.needs_checkpoint]
     parser.add_argument("--kinds", default=",".join(kinds), help="kinds of belief, comma-separated")
     args = parser.parse_args()
-    for path in args.fires or []:
+    for path in args.fires:
         print(f"\n{path.name}\n")
         score(list(recorded(path)), args.kinds.split(","))
-    for which in ("all", "tenth", "window") if args.fires is None else ():
-        print(f"\n{args.simulate} simulated fires, seen: {which}\n")
-        score(list(simulated(which, args.simulate, args.seed)), args.kinds.split(","))
 
 
 if __name__ == "__main__":

@@ -12,26 +12,24 @@ alone, without hidden states or rewards.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from torch import nn
 
-from emberwatch.benchmark import evaluate, suite, summary
+from emberwatch.benchmark import evaluate, summary
 from emberwatch.model import Model
 from emberwatch.planning import beam_search
 
 ENV = "emberwatch/Wildfire-v0"
 PARTS = ("belief", "frame", "robot")
 UNOBSERVED = 255
-#: Columns of the log: total seconds and moves, and mean rewards and losses since the last row.
-COLUMNS = ("cpu_seconds", "moves", "reward_per_path", "loss", "filters_loss", "env_seconds")
+#: Width of the beam, updates per step of the worlds, and steps between two lines of output.
+BEAM, UPDATES, REPORTS = 64, 2, 100
 
 
 class Sightings:
@@ -112,8 +110,7 @@ class Policy:
     @torch.no_grad()
     def plan(self, images: torch.Tensor, robots: np.ndarray) -> np.ndarray:
         values = self.belief(images)[:, self.model.target_state].exp().numpy() + 0.02
-        args = self.args
-        return beam_search(values, robots, args.n_moves, rng=self.rng, width=args.beam)
+        return beam_search(values, robots, self.args.n_moves, rng=self.rng, width=BEAM)
 
     def __call__(self, seen: dict[str, np.ndarray]) -> np.ndarray:
         return self.plan(self.look(seen), seen["robot"])
@@ -144,30 +141,29 @@ class Training:
     """The worlds in which the policy flies, and the network that learns from its frames."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        torch.set_num_threads(args.threads)
+        torch.set_num_threads(1)
         torch.manual_seed(args.seed)
         self.args, self.rng = args, np.random.default_rng([args.seed, 1])
         self.envs = gymnasium.make_vec(
             ENV,
             num_envs=args.worlds,
             autoreset_mode="SameStep",
-            max_episode_steps=args.episode,
+            max_episode_steps=400,
             observation=PARTS,
             **world(args),
         )
         model = self.envs.unwrapped.model
         self.observed_as = torch.from_numpy(model.observation_matrix).float()
         self.belief = Belief(model)
-        if args.load is not None:
-            self.belief.load_state_dict(torch.load(args.load))
         self.policy = Policy(self.belief, model, args)
 
     def learn(self) -> None:
         args = self.args
+        args.out.mkdir(parents=True, exist_ok=True)
         optimizer = torch.optim.Adam(self.belief.parameters())
         seen, _ = self.envs.reset(seed=args.seed)
         images = self.policy.look(seen)
-        replay, log, n_steps, env_seconds = Replay(images, 6_000), Log(args.out), 0, 0.0
+        replay, n_steps, log = Replay(images, 6_000), 0, []
         begin, used = time.process_time(), 0.0
         while n_steps == 0 or used < args.cpu_seconds:
             for group in optimizer.param_groups:
@@ -175,26 +171,20 @@ class Training:
             paths = self.policy.plan(images, seen["robot"])
             explores = self.rng.random(len(paths)) < 0.1
             paths[explores] = self.rng.integers(0, 4, (int(explores.sum()), args.n_moves))
-            step_begin = time.process_time()
             seen, rewards, _, truncated, _ = self.envs.step(paths)
-            env_seconds += time.process_time() - step_begin
             # The first frame of an episode is empty, so nothing is learned from it.
             replay.add(images, seen["frame"][..., 0])
             self.policy.sightings.forget(truncated)
             images = self.policy.look(seen)
-            losses = [self.update(optimizer, replay) for _ in range(args.updates)]
-            log.add(rewards.mean(), *np.mean(losses, axis=0))
+            losses = [self.update(optimizer, replay) for _ in range(UPDATES)]
+            log.append((rewards.mean(), *np.mean(losses, axis=0)))
             n_steps += 1
             used = time.process_time() - begin
-            if n_steps % 100 == 0:
-                log.write(used, n_steps * args.worlds * args.n_moves, env_seconds)
-                self.save()
-        if log.added:
-            log.write(used, n_steps * args.worlds * args.n_moves, env_seconds)
-        self.save()
-
-    def save(self) -> None:
-        torch.save(self.belief.state_dict(), self.args.out / "belief.pt")
+            if n_steps % REPORTS == 0 or used >= args.cpu_seconds:
+                reward, loss, filters = np.nanmean(log, axis=0)
+                log.clear()
+                print(f"{used:.0f} s: reward {reward:.2f}, loss {loss:.4f}, filter's {filters:.4f}")
+                torch.save(self.belief.state_dict(), args.out / "belief.pt")
 
     def update(self, optimizer: Any, replay: Replay) -> tuple[float, float]:
         """Updates the network once. Returns its loss and the filter's loss, in nats per cell."""
@@ -215,36 +205,6 @@ class Training:
         return loss.item(), loss_of(self.belief.filtered(images)).item()
 
 
-class Log:
-    """A CSV file with `COLUMNS`; its means are over the values added since the last row."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self.rows = csv.writer((folder / "log.csv").open("w", buffering=1))
-        self.rows.writerow(COLUMNS)
-        self.added: list[tuple[float, ...]] = []
-
-    def add(self, *numbers: float) -> None:
-        self.added.append(numbers)
-
-    def write(self, used: float, moves: int, env_seconds: float) -> None:
-        reward, loss, filters = np.nanmean(self.added, axis=0)
-        self.added.clear()
-        self.rows.writerow((used, moves, reward, loss, filters, env_seconds))
-        print(f"{used:4.0f} s: reward {reward:.2f}, loss {loss:.4f}, the filter's {filters:.4f}")
-
-
-def draw(folder: Path) -> None:
-    """Plots how far the network's loss is below the filter's."""
-    with (folder / "log.csv").open() as log:
-        rows = list(csv.DictReader(log))
-    gains = [float(row["filters_loss"]) - float(row["loss"]) for row in rows]
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    axes.plot([float(row["cpu_seconds"]) for row in rows], gains)
-    axes.set(xlabel="processor seconds", ylabel="gain over the filter, nats per visited cell")
-    figure.savefig(folder / "curve.png", dpi=120)
-
-
 def world(args: argparse.Namespace) -> dict[str, Any]:
     """Returns the keyword arguments of the environments."""
     names = ("model", "height", "width", "n_moves", "burn_in")
@@ -252,50 +212,21 @@ def world(args: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
 
 
-def seeds(text: str) -> range:
-    first, _, end = text.partition("..")
-    if not (first.isdigit() and end.isdigit() and int(first) < int(end)):
-        raise argparse.ArgumentTypeError(f"expected FIRST..END, got {text!r}")
-    return range(int(first), int(end))
-
-
-def positive(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a positive integer, got {text!r}")
-    return int(text)
-
-
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--cpu-seconds", type=float, default=300, help="processor seconds to train")
     parser.add_argument("--out", type=Path, default=Path("learned_belief"), help="output folder")
     parser.add_argument(
-        "--evaluate",
-        type=seeds,
-        default="5000..5008",
-        help="evaluation seeds, FIRST..END; seeds below 1000 are test worlds",
+        "--evaluate", default="5000..5008", help="seeds, FIRST..END; test worlds are below 1000"
     )
-    parser.add_argument("--steps", type=positive, default=100, help="evaluated paths per world")
-    parser.add_argument("--suite", type=Path, help="evaluate on the task small, into this folder")
-    parser.add_argument("--load", type=Path, help="saved network to start from")
+    parser.add_argument("--steps", type=int, default=100, help="evaluated paths per world")
     parser.add_argument("--name", default="learned_belief", help="name in the benchmark's table")
     parser.add_argument("--seed", type=int, default=1000, help="seed, also of the first world")
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--beam", type=positive, default=64, help="width of the beam")
-    parser.add_argument("--worlds", type=positive, default=64)
-    parser.add_argument("--episode", type=positive, default=400, help="paths per episode")
-    parser.add_argument("--updates", type=positive, default=2, help="updates per world step")
-    parser.add_argument("--threads", type=positive, default=1)
-    args = parser.parse_args()
-    if (args.out / "log.csv").exists():
-        parser.error(
-            f"--out: expected a folder without the log of an earlier training, got {args.out}"
-        )
-    if args.suite is not None and (args.suite / "small" / f"{args.name}.csv").exists():
-        parser.error(f"--suite: expected a folder without rows of {args.name}, got {args.suite}")
-    return args
+    parser.add_argument("--worlds", type=int, default=64)
+    return parser.parse_args()
 
 
 def main() -> None:
@@ -304,18 +235,16 @@ def main() -> None:
     training = Training(args)
     training.learn()
     training.envs.close()
-    draw(args.out)
-    shared = {"name": args.name, "env": ENV, "estimator": "network", "observation": PARTS}
-    if args.suite is not None:
-        rows = suite(training.policy, folder=args.suite, tasks=["small"], timeout=60.0, **shared)
-        print(summary(rows["small"]))
-        return
+    (args.out / "rows.csv").unlink(missing_ok=True)  # from an earlier training
     rows = evaluate(
         training.policy,
-        seeds=args.evaluate,
+        name=args.name,
+        env=ENV,
+        estimator="network",
+        observation=PARTS,
+        seeds=range(*map(int, args.evaluate.split(".."))),
         steps=args.steps,
         csv=args.out / "rows.csv",
-        **shared,
         **world(args),
     )
     print(summary(rows))

@@ -11,25 +11,26 @@ own moves reach (DAgger: Ross, Gordon, Bagnell, 2011). Then PPO improves it.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from torch import nn
 from torch.distributions import Categorical
 
-from emberwatch.benchmark import evaluate, suite, summary
+from emberwatch.benchmark import evaluate, summary
 from emberwatch.planning import beam_search
 
 ENV = "emberwatch/WildfireMoves-v0"
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
-#: Columns of the log: total use of resources, and the mean reward per path since the last row.
-COLUMNS = ("phase", "cpu_seconds", "seconds", "moves", "reward_per_path", "env_seconds", "entropy")
+#: Moves of a rollout, and the batches, epochs and constants of PPO.
+HORIZON, BATCH, EPOCHS, LEARNING_RATE = 32, 512, 4, 7e-4
+GAMMA, LAMBDA, ENTROPY = 0.95, 0.9, 0.01
+#: Number of rollouts after an imitation in which only the value function learns.
+VALUE_ROUNDS = 5
 
 
 class Network(nn.Module):
@@ -87,7 +88,7 @@ class Training:
     """The network, its worlds and its log."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        torch.set_num_threads(args.threads)
+        torch.set_num_threads(1)
         torch.manual_seed(args.seed)
         self.args = args
         imitates = ("belief", "robot", "visited", "move") if args.imitate > 0 else ()
@@ -104,34 +105,27 @@ class Training:
         self.network = Network(side, n_channels)
         self.rng = np.random.default_rng(args.seed)
         self.seen, _ = self.envs.reset(seed=args.seed)
-        self.begin, self.cpu = time.perf_counter(), time.process_time()
-        self.env_seconds, self.moves, self.rewards = 0.0, 0, []
+        self.begin = time.process_time()
+        self.moves, self.rewards = 0, []
         args.out.mkdir(parents=True, exist_ok=True)
-        self.log = (args.out / "log.csv").open("w", buffering=1)
-        self.rows = csv.writer(self.log)
-        self.rows.writerow(COLUMNS)
 
     def used(self) -> float:
         """Returns the processor seconds used so far."""
-        return time.process_time() - self.cpu
+        return time.process_time() - self.begin
 
     def windows(self) -> np.ndarray:
         return self.seen[self.args.observation]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-        begin = time.process_time()
         self.seen, rewards, _, truncated, infos = self.envs.step(actions)
-        self.env_seconds += time.process_time() - begin
         self.moves += len(actions)
         self.rewards.append(rewards.mean())
         return rewards, truncated, infos
 
-    def report(self, phase: str, entropy: float) -> None:
+    def report(self, phase: str) -> None:
+        """Prints the mean reward per path since the last report, and saves the network."""
         reward = float(np.mean(self.rewards)) * self.args.n_moves
         self.rewards.clear()
-        wall = time.perf_counter() - self.begin
-        row = (phase, self.used(), wall, self.moves, reward, self.env_seconds, entropy)
-        self.rows.writerow(row)
         print(f"{phase} {self.used():5.0f} s, {self.moves} moves: reward per path {reward:.2f}")
         torch.save(self.network.state_dict(), self.args.out / "ppo.pt")
 
@@ -174,24 +168,23 @@ class Training:
                 optimizer.step()
             round_ += 1
             if round_ % 25 == 0:
-                self.report("imitation", loss.item())
-        torch.save(self.network.state_dict(), self.args.out / "imitation.pt")
+                self.report("imitation")
 
     def improve(self) -> None:
         """Improves the policy by proximal policy optimisation (Schulman et al., 2017)."""
         args, first = self.args, self.used()
-        optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
+        optimizer = torch.optim.Adam(self.network.parameters(), LEARNING_RATE, eps=1e-5)
         rounds = 0
         while self.used() < args.cpu_seconds:
             share = (self.used() - first) / (args.cpu_seconds - first)
             for group in optimizer.param_groups:
-                group["lr"] = args.learning_rate * (1 - share)
+                group["lr"] = LEARNING_RATE * (1 - share)
             rollout = self.rollout()
-            only_value = args.imitate > 0 and rounds < args.value_rounds
-            entropy = self.update(optimizer, rollout, only_value=only_value)
+            only_value = args.imitate > 0 and rounds < VALUE_ROUNDS
+            self.update(optimizer, rollout, only_value=only_value)
             rounds += 1
             if rounds % 10 == 0:
-                self.report("PPO", entropy)
+                self.report("PPO")
 
     def rollout(self) -> list[torch.Tensor]:
         """Flies `horizon` moves. Returns windows, actions, log-probabilities, advantages,
@@ -201,7 +194,7 @@ class Training:
         turns, mirrored, names = SYMMETRIES[4 * self.rng.integers(2)]
         back = names.argsort()
         windows, actions, log_probabilities, values, rewards, ends = [], [], [], [], [], []
-        for _ in range(args.horizon):
+        for _ in range(HORIZON):
             window = turned(torch.from_numpy(self.windows()), turns, mirrored)
             with torch.no_grad():
                 logits, value = self.network(window)
@@ -213,7 +206,7 @@ class Training:
                 last = np.stack([seen[args.observation] for seen in infos["final_obs"][truncated]])
                 with torch.no_grad():
                     last = turned(torch.from_numpy(last), turns, mirrored)
-                    earned[end] += args.gamma * self.network(last)[1]
+                    earned[end] += GAMMA * self.network(last)[1]
             windows.append(window)
             actions.append(action)
             log_probabilities.append(moves.log_prob(action))
@@ -224,19 +217,18 @@ class Training:
             last = turned(torch.from_numpy(self.windows()), turns, mirrored)
             values.append(self.network(last)[1])
         advantages, advantage = [], torch.zeros(n)
-        for at in reversed(range(args.horizon)):
+        for at in reversed(range(HORIZON)):
             continues = 1 - ends[at]
-            error = rewards[at] + args.gamma * continues * values[at + 1] - values[at]
-            advantage = error + args.gamma * args.lambda_ * continues * advantage
+            error = rewards[at] + GAMMA * continues * values[at + 1] - values[at]
+            advantage = error + GAMMA * LAMBDA * continues * advantage
             advantages.insert(0, advantage)
         returns = [a + v for a, v in zip(advantages, values, strict=False)]
         parts = (windows, actions, log_probabilities, advantages, returns)
         return [torch.cat(part) for part in parts]
 
-    def update(self, optimizer: Any, rollout: list[torch.Tensor], *, only_value: bool) -> float:
-        args, entropies = self.args, []
-        for _ in range(args.epochs):
-            for batch in torch.randperm(len(rollout[0])).split(args.batch):
+    def update(self, optimizer: Any, rollout: list[torch.Tensor], *, only_value: bool) -> None:
+        for _ in range(EPOCHS):
+            for batch in torch.randperm(len(rollout[0])).split(BATCH):
                 windows, actions, before, advantages, returns = (part[batch] for part in rollout)
                 logits, values = self.network(windows)
                 moves = Categorical(logits=logits)
@@ -246,7 +238,7 @@ class Training:
                 entropy = moves.entropy().mean()
                 loss = 0.5 * (values - returns).square().mean()
                 if not only_value:
-                    loss = 0.5 * loss - gain - args.entropy * entropy
+                    loss = 0.5 * loss - gain - ENTROPY * entropy
                 optimizer.zero_grad()
                 loss.backward()
                 if only_value:  # shared layers and policy stay unchanged
@@ -254,8 +246,6 @@ class Training:
                         parameter.grad = parameter.grad if name.startswith("value") else None
                 nn.utils.clip_grad_norm_(self.network.parameters(), 0.5)
                 optimizer.step()
-                entropies.append(entropy.item())
-        return float(np.mean(entropies))
 
 
 def acting(network: Network, *, sampled: bool) -> Any:
@@ -277,23 +267,9 @@ def acting(network: Network, *, sampled: bool) -> Any:
     return act
 
 
-def draw(folder: Path) -> None:
-    """Plots the learning curve from the log."""
-    with (folder / "log.csv").open() as log:
-        rows = list(csv.DictReader(log))
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    for phase in dict.fromkeys(row["phase"] for row in rows):
-        part = [row for row in rows if row["phase"] == phase]
-        seconds = [float(row["cpu_seconds"]) for row in part]
-        axes.plot(seconds, [float(row["reward_per_path"]) for row in part], label=phase)
-    axes.set(xlabel="processor seconds", ylabel="reward per path, sampled moves")
-    axes.legend()
-    figure.savefig(folder / "curve.png", dpi=120)
-
-
 def world(args: argparse.Namespace) -> dict[str, Any]:
     """Returns the keyword arguments of the environments."""
-    names = ("model", "height", "width", "n_moves", "burn_in", "window")
+    names = ("model", "height", "width", "n_moves", "burn_in")
     # A long timeout, for busy machines.
     return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
 
@@ -307,60 +283,34 @@ def arguments() -> argparse.Namespace:
         "--evaluate", default="5000..5008", help="seeds, FIRST..END; test worlds are below 1000"
     )
     parser.add_argument("--steps", type=int, default=100, help="evaluated paths per world")
-    parser.add_argument("--suite", type=Path, help="evaluate on the task small, into this folder")
     parser.add_argument("--sampled", action="store_true", help="evaluate sampled moves")
-    parser.add_argument("--load", type=Path, help="saved network to start from")
     parser.add_argument("--name", default="ppo", help="name in the benchmark's table")
     parser.add_argument("--seed", type=int, default=1000, help="seed, also of the first world")
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--observation", choices=("local", "recent"), default="local")
-    parser.add_argument("--window", type=int, default=15, help="side of the window in cells")
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--horizon", type=int, default=32, help="moves per rollout")
-    parser.add_argument("--batch", type=int, default=512)
-    parser.add_argument("--epochs", type=int, default=4)
-    parser.add_argument("--value-rounds", type=int, default=5, help="first rollouts: value only")
-    parser.add_argument("--learning-rate", type=float, default=7e-4)
-    parser.add_argument("--gamma", type=float, default=0.95)
-    parser.add_argument("--lambda", dest="lambda_", type=float, default=0.9)
-    parser.add_argument("--entropy", type=float, default=0.01)
-    parser.add_argument("--threads", type=int, default=1)
-    args = parser.parse_args()
-    if args.suite is not None and (args.suite / "small" / f"{args.name}.csv").exists():
-        parser.error(f"--suite: expected a folder without rows of {args.name}, got {args.suite}")
-    return args
+    return parser.parse_args()
 
 
 def main() -> None:
     """Trains, then scores the policy for the benchmark's table."""
     args = arguments()
     training = Training(args)
-    if args.load is not None:
-        training.network.load_state_dict(torch.load(args.load))
     training.imitate()
     training.improve()
     training.envs.close()
-    training.log.close()
-    draw(args.out)
-    policy = acting(training.network, sampled=args.sampled)
-    shared = {"name": args.name, "observation": args.observation}
-    if args.suite is not None:
-        rows = suite(
-            policy, folder=args.suite, tasks=["small"], window=args.window, timeout=60.0, **shared
-        )["small"]
-    else:
-        (args.out / "rows.csv").unlink(missing_ok=True)  # from an earlier training
-        first, end = map(int, args.evaluate.split(".."))
-        rows = evaluate(
-            policy,
-            seeds=range(first, end),
-            steps=args.steps,
-            csv=args.out / "rows.csv",
-            **shared,
-            **world(args),
-        )
+    (args.out / "rows.csv").unlink(missing_ok=True)  # from an earlier training
+    rows = evaluate(
+        acting(training.network, sampled=args.sampled),
+        name=args.name,
+        seeds=range(*map(int, args.evaluate.split(".."))),
+        steps=args.steps,
+        observation=args.observation,
+        csv=args.out / "rows.csv",
+        **world(args),
+    )
     print(summary(rows))
 
 

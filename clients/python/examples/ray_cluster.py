@@ -33,16 +33,7 @@ import emberwatch
 from emberwatch.errors import EmberwatchError
 
 MOVES = "emberwatch/WildfireMoves-v0"
-WORLD: dict[str, Any] = {
-    "model": "wildfire-small",
-    "height": 16,
-    "width": 16,
-    "n_moves": 16,
-    "burn_in": 3000,
-}
-#: `WORLD` as flags of a server.
-FLAGS = "--model=wildfire-small --height=16 --width=16 --moves=16 --burn-in=3000".split()
-SEEN = {"observation": "local", "max_episode_steps": 96}
+SEEN: dict[str, Any] = {"observation": "local", "max_episode_steps": 96}
 
 
 @ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)
@@ -51,7 +42,7 @@ class NodeServer:
 
     def __init__(self, n_worlds: int) -> None:
         self._instance = f"ray-{uuid.uuid4().hex}"
-        self._command = ["emberwatch-server", f"--instance={self._instance}", *FLAGS]
+        self._command = ["emberwatch-server", f"--instance={self._instance}", "--task=small"]
         self._command += [f"--worlds={n_worlds}", f"--exit-with={os.getpid()}"]
         self._start()
 
@@ -94,8 +85,6 @@ def on(node: str) -> dict[str, Any]:
 def make(settings: dict[str, Any]) -> gymnasium.vector.VectorEnv:
     """Makes all environments of a runner, in its process."""
     n_worlds = settings["num_envs"]
-    if settings["own"]:
-        return scaled(gymnasium.make_vec(MOVES, n_worlds, **WORLD, **SEEN))
     node = ray.get_runtime_context().get_node_id()
     instance = ray.get(ray.get_actor("servers").instance.remote(node))
     for part in range(settings["runners"]):
@@ -179,7 +168,6 @@ def main() -> None:
     parser.add_argument("--runners", type=int, default=4, help="at most 15 per node")
     parser.add_argument("--worlds", type=int, default=8, help="worlds per runner")
     parser.add_argument("--batch", type=int, default=4000, help="moves per iteration")
-    parser.add_argument("--own", action="store_true", help="simulate in the runners' processes")
     parser.add_argument(
         "--kill", action="store_true", help="kill a local runner and a local server"
     )
@@ -198,7 +186,7 @@ def main() -> None:
     servers = Servers.options(name="servers", **here).remote(args.runners * args.worlds)
     config = (
         PPOConfig()
-        .environment("wildfire", env_config={"runners": args.runners, "own": args.own})
+        .environment("wildfire", env_config={"runners": args.runners})
         .env_runners(
             num_env_runners=args.runners,
             num_envs_per_env_runner=args.worlds,

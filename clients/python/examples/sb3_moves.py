@@ -1,6 +1,9 @@
 """Stable-Baselines3's PPO on many worlds of `emberwatch/WildfireMoves-v0`, with local windows.
 
 python sb3_moves.py --total-steps 500000 --out sb3 --evaluate 0..32
+
+With `--robots 4 --reward marginal`, one policy flies all robots of a world, each of which sees the
+belief from its own frames.
 """
 
 from __future__ import annotations
@@ -10,10 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import matplotlib.pyplot as plt
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecMonitor
 from torch import nn
@@ -38,39 +39,13 @@ class Windows(BaseFeaturesExtractor):
         return self.last(self.layers(windows))
 
 
-class Curve(BaseCallback):
-    """Writes moves and reward per path to a file, one row per rollout."""
-
-    def __init__(self, file: Path, n_moves: int) -> None:
-        super().__init__()
-        self.file, self.n_moves = file, n_moves
-
-    def _on_training_start(self) -> None:
-        self.file.write_text("moves,reward_per_path\n")
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        reward = self.model.rollout_buffer.rewards.mean() * self.n_moves
-        with self.file.open("a") as file:
-            file.write(f"{self.num_timesteps},{reward}\n")
-
-
-def draw(log: Path) -> None:
-    """Plots the learning curve from the log."""
-    rows = [tuple(map(float, line.split(","))) for line in log.read_text().splitlines()[1:]]
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    axes.plot(*zip(*rows, strict=True))
-    axes.set(xlabel="moves", ylabel="reward per path, sampled moves")
-    figure.savefig(log.with_name("curve.png"), dpi=120)
-
-
 def main() -> None:
     """Trains, then scores the policy for the benchmark's table."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--total-steps", type=int, default=500_000, help="training moves")
+    parser.add_argument("--total-steps", type=int, default=500_000, help="moves of all robots")
     parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--robots", type=int, default=1, help="robots in each world")
+    parser.add_argument("--reward", default="move", help="with several robots: marginal, share ...")
     parser.add_argument("--grid", type=int, default=16, help="height and width in cells")
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--out", type=Path, default=Path("sb3"), help="output folder")
@@ -86,9 +61,14 @@ def main() -> None:
         "n_moves": 16,
         "burn_in": 3000,
         "observation": "local",
+        "robots": args.robots,
     }
     envs = make_vec_env(
-        "emberwatch/WildfireMoves-v0", args.worlds, reward="move", max_episode_steps=800, **world
+        "emberwatch/WildfireMoves-v0",
+        args.worlds * args.robots,
+        reward=args.reward,
+        max_episode_steps=800,
+        **world,
     )
     model = PPO(
         "CnnPolicy",
@@ -103,21 +83,18 @@ def main() -> None:
         ent_coef=0.01,
         seed=args.seed,
         device="cpu",
-        verbose=1,
+        verbose=1,  # prints the mean reward of an episode
     )
-    log = args.out / "log.csv"
-    model.learn(args.total_steps, callback=Curve(log, world["n_moves"]), log_interval=10)
+    model.learn(args.total_steps, log_interval=10)
     model.save(args.out / "ppo")
     model.get_env().close()
-    draw(log)
 
     (args.out / "rows.csv").unlink(missing_ok=True)  # from an earlier training
-    first, end = map(int, args.evaluate.split(".."))
     rows = evaluate(
         model,
         name="sb3_ppo",
         deterministic=False,  # the most probable moves may run in circles
-        seeds=range(first, end),
+        seeds=range(*map(int, args.evaluate.split(".."))),
         steps=args.steps,
         csv=args.out / "rows.csv",
         **world,

@@ -14,15 +14,13 @@ choice matters on `burnout` and `latent`. On the belief of a learned filter:
 from __future__ import annotations
 
 import argparse
-import time
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import nn
 
@@ -65,26 +63,6 @@ class ScaledRewards(VecEnvWrapper):
         return observations, REWARD_SCALE * rewards, done, infos
 
 
-class Progress(BaseCallback):
-    """Prints the mean reward of each twentieth of the training."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._rewards: list[float] = []
-
-    def _on_training_start(self) -> None:
-        self._start = time.monotonic()
-
-    def _on_step(self) -> bool:
-        self._rewards.append(float(self.locals["rewards"].mean()) / REWARD_SCALE)
-        part = max(1, self.model._total_timesteps // 20)
-        if self.num_timesteps // part > (self.num_timesteps - self.training_env.num_envs) // part:
-            reward, seconds = np.mean(self._rewards), time.monotonic() - self._start
-            self._rewards.clear()
-            print(f"{self.num_timesteps:7} decisions, {seconds:4.0f} s: {reward:5.2f}", flush=True)
-        return True
-
-
 def mean_rewards(envs: VecEnv, choose: Any, seed: int, n_steps: int) -> NDArray[np.float64]:
     """Returns the mean reward per step of each world, whose first episode has `seed`."""
     envs.seed(seed)
@@ -118,7 +96,7 @@ def learner(envs: VecEnv, seed: int) -> DQN:
     updates = max(1, envs.num_envs // 8)
     return DQN(
         ScoringPolicy,
-        ScaledRewards(envs),
+        ScaledRewards(VecMonitor(envs)),
         seed=seed,
         learning_rate=lambda left: 1e-3 * max(0.1, left),
         buffer_size=120_000,
@@ -132,6 +110,7 @@ def learner(envs: VecEnv, seed: int) -> DQN:
         target_update_interval=envs.num_envs,
         exploration_initial_eps=0.5,
         exploration_fraction=0.5,
+        verbose=1,  # prints the mean reward of an episode
     )
 
 
@@ -162,7 +141,7 @@ def main() -> None:
     # Episodes are long because a burn-in costs as much as hundreds of steps.
     envs = make_vec_env(name, args.worlds, max_episode_steps=1_000, **world)
     model = learner(envs, args.seed)
-    model.learn(args.total_steps, callback=Progress(), log_interval=None)
+    model.learn(args.total_steps, log_interval=args.worlds)
     envs.close()
     if args.out is not None:
         model.save(args.out)

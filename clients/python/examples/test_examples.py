@@ -14,33 +14,31 @@ FOLDER = Path(__file__).parent
 
 #: Each example, short arguments, and a pattern that its output must match.
 EXAMPLES = [
-    ("dqn.py", "--total-steps 3000 --report-every 1000", r"3000  reward per path (?!0\.00)\d"),
     (
         "sb3_moves.py",
-        "--total-steps 600 --worlds 4 --steps 5 --out OUT",
+        "--total-steps 600 --worlds 4 --steps 5",
+        r"sb3_ppo: \d\S* \+- \S+ a step on 8 worlds",
+    ),
+    (
+        "sb3_moves.py",
+        "--total-steps 400 --worlds 2 --robots 4 --reward marginal --steps 5",
         r"sb3_ppo: \d\S* \+- \S+ a step on 8 worlds",
     ),
     (
         "ppo.py",
-        "--worlds 8 --imitate 3 --cpu-seconds 6 --steps 5 --out OUT",
+        "--worlds 8 --imitate 3 --cpu-seconds 6 --steps 5",
         r"ppo: \d\S* \+- \S+ a step on 8 worlds",
     ),
     (
         "learned_belief.py",
-        "--worlds 8 --cpu-seconds 6 --steps 5 --out OUT",
+        "--worlds 8 --cpu-seconds 6 --steps 5",
         r" s: reward \d\S+ loss \d(.*\n)+learned_belief: \d\S* \+- \S+ a step on 8 worlds",
     ),
     (
         "sb3_objective.py",
         "--model wildfire --moves 64 --worlds 4 --total-steps 500 --test-worlds 2 --test-steps 50",
-        r"500 decisions, .*\nDQN .*\nrandom .*\nexploit +[1-9]",
+        r"DQN .*\nrandom .*\nexploit +[1-9]",
     ),
-    (
-        "sb3_objective.py",
-        "--model wildfire --moves 64 --worlds 2 --total-steps 4 --test-worlds 2 --test-steps 50",
-        r" 4 decisions, .*\nDQN .*\nrandom .*\nexploit +[1-9]",
-    ),
-    ("rllib_ppo.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* steps, reward of an epi"),
     ("rllib_team.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* moves, reward of .* \d"),
     (
         "ray_cluster.py",
@@ -48,27 +46,20 @@ EXAMPLES = [
         r"runner (\d+) is killed\n(?:.*\n)*server (\d+) is killed\n(?:.*\n)*"
         r"iteration (?!.*\b(?:\1|\2)\b)\d+: .*(?:, runners \[\d+(?:, \d+)?\] on server \d+){2}\n",
     ),
-    (
-        "supersuit_team.py",
-        "--total-steps 400 --worlds 2 --steps 5",
-        r"ppo_marginal: \d\S* \+- \S+ a step on 8 worlds\nvisited twice: \d",
-    ),
     ("mcts.py", "--seeds 1000..1002 --steps 3", r"mcts: \d\S* \+- \S+ a step on 2 worlds"),
-    ("minari_dataset.py", "--episodes 2 --steps 20", r"2 episodes, 40 steps"),
     (
         "filter_benchmark.py",
-        "--simulate 2",
-        r"seen: window\n(.*\n)*\| known\+spatial\+cavities \| 0\.\d+ \| 0\.\d+ \| -0\.\d+ ±",
+        f"{FOLDER.parent}/tests/data/fires/fires-window.npz",
+        r"\| known\+spatial\+cavities \| 0\.\d+ \| 0\.\d+ \| -0\.\d+ ±",
     ),
     ("swap.py", "--steps 50", r"Python takes over\n(.*\n)*.*code 3 .*\n.*second Rust agent flew"),
-    ("live_plot.py", "--start --instance plot --frames 60 --out OUT/plot.png", ""),
 ]
 
 
 @pytest.mark.parametrize(("name", "arguments", "line"), EXAMPLES, ids=[e[0] for e in EXAMPLES])
 def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
     command = [sys.executable, str(FOLDER / name)]
-    command += arguments.replace("OUT", str(tmp_path)).split()
+    command += arguments.split()
     # Finds programs that pip installed next to Python. With "local", Ray starts its own cluster
     # instead of joining another example's.
     path = f"{os.environ['PATH']}:{Path(sys.executable).parent}"
@@ -79,9 +70,6 @@ def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -
     assert done.returncode == 0, done.stderr[-3000:]
     assert re.search(line, done.stdout), done.stdout
     assert "the state that pays most" not in done.stderr, "a world with nothing to find"
-    plots = list(tmp_path.glob("*.png"))
-    assert bool(plots) == ("OUT" in arguments)
-    assert all(plot.stat().st_size > 10_000 for plot in plots)
 
 
 def test_every_example_is_run() -> None:

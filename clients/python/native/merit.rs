@@ -10,7 +10,7 @@ use numpy::{PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 
-/// The fields of Python's `Merit`.
+/// The figures of a row of Python's benchmark, from `steps_to_detection` to `grid_seen_share`.
 type Figures = (Option<u64>, Option<u32>, Option<f64>, Option<f64>, f64);
 
 /// The running figures of merit of several worlds, which step together.
@@ -38,7 +38,7 @@ impl MeritTally {
         })
     }
 
-    /// Adds one step of all worlds; see Python's `MeritTally.update`.
+    /// Adds one step of all worlds.
     fn update(
         &mut self,
         py: Python<'_>,

@@ -262,7 +262,6 @@ GIVEN_LONG: dict[str, Callable[[Any], object]] = {
     "csv": lambda long: evaluate(
         lambda seen: seen, name="a", csv=long, seeds=[1], steps=1, model=LIVELY, burn_in=0
     ),
-    "tasks": lambda long: suite(lambda seen: seen, name="a", folder="no", tasks=["small"] * 900),
     "policies": lambda long: suite({long: 1}, name="a", folder="no", tasks=["small"]),
 }
 

@@ -93,10 +93,11 @@ def test_replayed_paths_have_exactly_the_same_scores(
 
 
 def test_rows_join_the_ladder_of_policies(tmp_path: Path) -> None:
-    file, figures = tmp_path / "mine.csv", tmp_path / "figures"
+    figures, flags = tmp_path / "figures", ["--policies=random_walk,coverage"]
     for name in ("mine", "other"):
-        score(name, csv=file, append=True)
-    flags = ["--policies=random_walk,coverage", "--baseline=coverage", f"--add={file}"]
+        score(name, csv=tmp_path / f"{name}.csv")
+        flags.append(f"--add={tmp_path / name}.csv")
+    flags.append("--baseline=coverage")
     flags += [f"--{name.replace('_', '-')}={value}" for name, value in FLAGS.items()]
     shown = compare(*flags, f"--figures={figures}", f"--csv={tmp_path / 'all.csv'}")
     assert "| mine " in shown and "| other " in shown
@@ -121,24 +122,19 @@ def rows_of(policy: str, *rewards: float, first: int = 1000, **changes: Any) -> 
 
 def test_a_summary_has_differences_from_a_baseline() -> None:
     base, better = rows_of("base", 1.0, 2.0, 4.0), rows_of("better", 2.0, 5.0, 9.0)
-    # Differences 1, 3 and 5: mean 3, variance 4, error sqrt(4 / 3) = 1.155. Student's t with 2
-    # degrees of freedom is 4.303 at 97.5 %, so the interval is 3 +- 4.97.
+    # Differences 1, 3 and 5: mean 3, variance 4, error sqrt(4 / 3) = 1.155.
     assert summary([*better[::-1], *base], baseline="base").splitlines() == [
-        "better: 5.33 +- 2.03 a step on 3 worlds; difference from base: +3.00 +- 1.15 [-1.97, "
-        "+7.97]",
+        "better: 5.33 +- 2.03 a step on 3 worlds; difference from base: +3.00 +- 1.15",
         "base: 2.33 +- 0.88 a step on 3 worlds",
     ]
     assert summary(base + better).splitlines()[1] == "better: 5.33 +- 2.03 a step on 3 worlds"
-    # Differences 0.1, 0.3 and eight zeros: t with 9 degrees of freedom is 2.262.
-    ten = rows_of("base", *[0.0] * 10) + rows_of("better", 0.1, 0.3, *[0.0] * 8)
-    assert summary(ten, baseline="base").endswith("+0.04 +- 0.03 [-0.03, +0.11]")
     tests = rows_of("base", 1.0, 2.0, first=FIRST_TRAINING_SEED - 1)
     assert summary(tests).endswith("a step on 2 (1 test) worlds")
-    assert summary(tests[:1]).endswith("a step on 1 test world, too few for a standard error")
+    assert summary(tests[:1]) == "base: 1.00 a step on 1 test world"
     with refuses("rows: expected at least one, got none"):
         summary([])
     one = summary(base[:1] + better[:1], baseline="base").splitlines()[1]
-    assert one.endswith("on 1 world, too few for a standard error; difference from base: +1.00")
+    assert one.endswith("on 1 world; difference from base: +1.00")
 
 
 def test_rows_that_do_not_pair_are_refused() -> None:
@@ -163,8 +159,6 @@ def test_rows_that_do_not_pair_are_refused() -> None:
     ("changes", "problem"),
     [
         ({"policy": None}, "policy: expected a function of observations, or a model of .*, got No"),
-        ({"name": ""}, "name: expected a name for the table, got ''"),
-        ({"estimator": "a\nb"}, r"estimator: expected a name for the table, got 'a\\nb'"),
         ({"seeds": []}, "seeds: expected at least one seed, without duplicates"),
         ({"seeds": [4, 4]}, "seeds: expected at least one seed, without duplicates"),
         ({"seeds": 8}, "seeds: expected one for each world, got int"),

@@ -4,7 +4,7 @@ A frame shows only the cells of one path. A belief sums up all frames so far, so
 without memory can act on it.
 """
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
@@ -155,26 +155,15 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     def _begin(self, step: int, frame: NDArray[np.uint8]) -> None:
         """Begins an episode, or joins one at a later step."""
-        continues = getattr(self.env.unwrapped, "continues", False)
+        unwrapped: Any = self.env.unwrapped
+        continues = getattr(unwrapped, "continues", False)
         if not (continues and self._was_begun and step == self._step):
             self._belief.reset()
-            for past in self._past_frames(step):
+            for past in unwrapped.past_frames() if step > 0 else ():
                 self._belief.correct(past)
                 self._belief.predict()
             self._belief.correct(frame)
         self._step, self._is_begun = step, True
-
-    def _past_frames(self, step: int) -> Iterable[NDArray[np.uint8]]:
-        if step == 0:
-            return ()
-        past = getattr(self.env.unwrapped, "past_frames", None)
-        if past is not None:
-            return past()
-        gymnasium.logger.warn(
-            f"BeliefObservation: the episode is joined at step {step}, and the environment has no "
-            "method `past_frames`: the belief begins anew"
-        )
-        return ()
 
     @contextmanager
     def _between(self) -> Generator[None]:

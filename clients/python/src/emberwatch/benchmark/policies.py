@@ -22,86 +22,49 @@ Policy: TypeAlias = Callable[..., Any]
 
 
 class Actor:
-    """A policy that acts in one batch of worlds after another, with its state in this batch."""
+    """A policy that acts in one batch of worlds, with its state there."""
 
-    def __init__(self, policy: Any, *, deterministic: bool) -> None:
-        """Determines the parameters of the policy, a function or an object with `predict`."""
-        self._call: Any = getattr(policy, "predict", policy)
-        if not callable(self._call):
+    def __init__(self, policy: Any, worlds: Any, shown: Any, *, deterministic: bool) -> None:
+        """Refuses worlds that the policy cannot act in, without or with wrappers (`shown`)."""
+        self._policy, self._worlds, self._deterministic = policy, worlds, deterministic
+        self._predict: Final[Any] = getattr(policy, "predict", None)
+        if self._predict is None and not callable(policy):
             expected = "a function of observations, or a model of Stable-Baselines3"
             raise invalid("policy", expected, repr_of(policy))
-        # If the policy is a method of a model, this is the model.
-        self._model: Any = getattr(policy, "__self__", policy)
-        self._begin: Any = getattr(policy, "begin", None)
-        self._deterministic: Final = deterministic
-        try:
-            # The first parameter is the observation, whatever its name.
-            parameters = list(inspect.signature(self._call).parameters.values())[1:]
-        except (TypeError, ValueError):  # written in C
-            parameters = []
-        self._takes = {each.name for each in parameters}
-        if self._call is not policy and any(it.kind is it.VAR_KEYWORD for it in parameters):
-            self._takes |= {"state", "episode_start", "deterministic"}
-        self._needs = {each.name for each in parameters if each.default is each.empty}
-        #: The `VecNormalize` of the training, unless wrappers normalize the observations.
-        self._normalizer: Any = getattr(self._model, "get_vec_normalize_env", lambda: None)()
-        if not getattr(self._normalizer, "norm_obs", True):
-            self._normalizer = None
-        self._state: Any = None
-        self._starts: NDArray[np.bool_] = np.empty(0, np.bool_)
-
-    def check(self, worlds: Any, shown: Any) -> None:
-        """Refuses worlds that the policy cannot act in, without or with wrappers (`shown`)."""
-        if "action_masks" in self._needs and not hasattr(worlds, "action_masks"):
+        is_masked = self._predict and "action_masks" in inspect.signature(self._predict).parameters
+        self._is_masked: Final = bool(is_masked)
+        if self._is_masked and not hasattr(worlds, "action_masks"):
             expected = "an environment with action masks, which the policy needs"
             raise invalid("env", expected, "one without")
-        if shown is not worlds:  # wrappers normalize the observations
-            self._normalizer = None
         seen = shown.single_observation_space
-        expected = getattr(self._model, "observation_space", seen)
-        # Normalization changes the bounds.
-        content: Any = _content if self._normalizer is None else spaces.flatdim
-        if content(expected) != content(seen):
+        expected = getattr(policy, "observation_space", seen)
+        # A loaded model no longer refers to its `VecNormalize`, but expects other observations.
+        is_normalized = getattr(policy, "get_vec_normalize_env", lambda: None)() is not None
+        if _content(expected) != _content(seen) or (is_normalized and shown is worlds):
             raise InvalidArgumentError(
                 f"policy: expected the observations that it was trained on, {expected}, got "
                 f"{seen}: pass the observation= of its training, and if the training wrapped its "
                 "worlds, wrap=, such as lambda worlds: VecFrameStack(worlds, 4), or "
                 "lambda worlds: VecNormalize.load('statistics.pkl', worlds)"
             )
+        begin: Any = getattr(policy, "begin", None)
+        if begin is not None:
+            begin(worlds.num_envs // worlds.world_spec.n_robots)
+        self._state: Any = None
+        self._starts: NDArray[np.bool_] = np.ones(worlds.num_envs, np.bool_)
 
-    def begin(self, n_worlds: int, n_rows: int) -> None:
-        """Resets the state for a new batch of worlds, and calls the policy's `begin`, if any."""
-        if self._begin is not None:
-            self._begin(n_worlds)
-        self._state, self._starts = None, np.ones(n_rows, np.bool_)
-
-    def act(self, seen: Any, worlds: Any) -> NDArray[Any]:
-        """Returns the actions for the observations of some worlds as a new array."""
-        if self._normalizer is not None:
-            seen = self._normalizer.normalize_obs(seen)
-        offered = {
-            "state": self._state,
-            "episode_start": self._starts,
-            "deterministic": self._deterministic,
-        }
-        if "action_masks" in self._takes and hasattr(worlds, "action_masks"):
-            offered["action_masks"] = np.asarray(worlds.action_masks(), np.bool_)
-        result: Any = self._call(seen, **{it: offered[it] for it in offered if it in self._takes})
-        self._state, self._starts = None, np.zeros_like(self._starts)
-        if _is_pair(result, worlds.action_space.shape):
-            result, self._state = result
-        if self._state is not None and "state" not in self._takes:
-            raise InvalidArgumentError(
-                "policy: it returns a state with its actions, but has no parameter `state` for the "
-                "next call: pass the model itself, or return only the actions"
-            )
-        return np.array(as_array(result, "policy", "actions"))  # a policy may reuse its array
-
-
-def _is_pair(result: Any, shape: tuple[int, ...]) -> bool:
-    """Returns whether a result has actions and a state, instead of the actions of two rows."""
-    parts = cast("tuple[Any, ...]", result) if isinstance(result, tuple) else ()
-    return len(parts) == 2 and as_array(parts[0], "policy", "actions").shape == shape
+    def act(self, seen: Any) -> NDArray[Any]:
+        """Returns the actions for the observations of the worlds as a new array."""
+        if self._predict is None:
+            actions = self._policy(seen)
+        else:
+            given: dict[str, Any] = {"state": self._state, "episode_start": self._starts}
+            if self._is_masked:
+                given["action_masks"] = np.asarray(self._worlds.action_masks(), np.bool_)
+            actions, self._state = self._predict(seen, **given, deterministic=self._deterministic)
+            self._starts = np.zeros_like(self._starts)
+        # A copy, as a policy may reuse its array.
+        return np.array(as_array(actions, "policy", "actions, without a state"))
 
 
 def _content(space: Any) -> Any:

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
-import shutil
 from collections.abc import Generator, Iterable
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import MISSING, astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, TextIO
 
 from emberwatch.common.paths import utf8
-from emberwatch.errors import (
-    ExistingFileError,
-    InvalidArgumentError,
-    invalid,
-    repr_of,
-    shortened,
-)
+from emberwatch.errors import ExistingFileError, invalid, shortened
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,10 +60,6 @@ class Row:
     training_seconds: float | None = None
 
 
-#: The first line of a file.
-_HEADER: Final = ",".join(field.name for field in fields(Row))
-
-
 def read(path: str | os.PathLike[str]) -> list[Row]:
     """Reads the rows of a CSV file of `evaluate` or `emberwatch-agent compare`.
 
@@ -85,7 +73,8 @@ def read(path: str | os.PathLike[str]) -> list[Row]:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             return [_row(line) for line in csv.DictReader(file)]
     except (ValueError, csv.Error) as error:
-        raise invalid("csv", f"{path} to have the columns {_HEADER}", error) from None
+        columns = ",".join(field.name for field in fields(Row))
+        raise invalid("csv", f"{path} to have the columns {columns}", error) from None
 
 
 def _row(line: dict[Any, Any]) -> Row:
@@ -103,115 +92,30 @@ def _row(line: dict[Any, Any]) -> Row:
     return Row(**values)
 
 
-class RowFile:
-    """A file that the rows of one policy are written to at once, or appended to."""
-
-    def __init__(
-        self, path: str | os.PathLike[str], policy: str, worlds: set[Any], *, append: bool
-    ) -> None:
-        """Creates the folder, and checks that rows can be written.
-
-        Args:
-            path: The file.
-            policy: The policy's name, which must not be in the file.
-            worlds: The fingerprint, seed and number of steps of each world, as in the file.
-            append: Whether the file may exist.
-        """
-        # Links are resolved, as renaming a file onto a link would replace the link.
-        self._path: Final = Path(os.path.realpath(utf8("csv", path)))
-        self._partial: Final = self._path.with_name(f"{self._path.name}.partial")
-        self._policy, self._worlds, self._append = policy, worlds, append
-        self._present()
-        check_writable(self._path)
-
-    def save(self, rows: list[Row]) -> None:
-        """Writes the file, with the rows that it already had first; checks it again."""
-        _write(self._path, self._present() + rows, is_new=not self._append)
-        self._partial.unlink(missing_ok=True)
-
-    def save_partial(self, rows: list[Row]) -> str:
-        """Writes rows to another file; returns where they are, or the rows if this fails."""
-        done = f"{len(rows)} of {len(self._worlds)} worlds finished, their rows"
-        try:
-            _write(self._partial, rows, is_new=False)
-        except InvalidArgumentError:
-            return f"{done} could not be saved:\n{_text(rows)}"
-        return f"{done} are in {self._partial}"
-
-    def _present(self) -> list[Row]:
-        """Returns the rows of the file; checks that rows can be added to them."""
-        if not os.path.exists(self._path):  # unlike `Path.exists`, no error if the name is too long
-            return []
-        if not self._append or not self._path.is_file():
-            raise ExistingFileError(
-                f"csv: {self._path} already exists: choose another file, or add rows to a file of "
-                "rows with append=True"
-            )
-        rows = read(self._path)
-        header = self._path.read_text("utf-8-sig").splitlines()[0] if rows else _HEADER
-        if header != _HEADER:
-            others = ", ".join(sorted({*header.split(",")} ^ {*_HEADER.split(",")}))
-            expected = f"{self._path} to have the columns of evaluate"
-            raise invalid("csv", expected, f"other ones: {others or 'another order'}")
-        if self._policy in {row.policy for row in rows}:
-            raise invalid("name", f"one that is not in {self._path}", repr_of(self._policy))
-        worlds = {(row.worlds_fingerprint, row.world_seed, row.steps) for row in rows}
-        if rows and worlds != self._worlds:
-            raise InvalidArgumentError(
-                f"csv: {self._path} has rows of other worlds: their seeds, steps, model, grid, "
-                "start, sensor, burn-in, moves or robots differ; choose another file"
-            )
-        return rows
-
-
-def check_writable(path: Path) -> None:
-    """Creates the folder of a file, and checks that files can be written in it."""
-    with _temporary(path):
-        pass
-
-
-def _write(path: Path, rows: list[Row], *, is_new: bool) -> None:
-    """Writes a whole file at once, with the mode of the old file. `is_new` refuses an old file."""
-    with _temporary(path) as temporary:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            file.write(_text(rows))
-            file.flush()
-            os.fsync(file.fileno())
-        if is_new:
-            _link(temporary, path)
-        else:
-            if path.exists():
-                shutil.copymode(path, temporary)
-            temporary.replace(path)
-
-
-def _link(temporary: Path, path: Path) -> None:
-    """Gives a file a second name. Fails if another process has created a file of this name."""
-    try:
-        os.link(temporary, path)
-    except OSError:  # perhaps the file system has no hard links
-        if os.path.lexists(path):
-            raise
-        temporary.replace(path)
-
-
-def _text(rows: Iterable[Row]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(astuple(row) for row in rows)
-    return f"{_HEADER}\n{text.getvalue()}"
-
-
 @contextmanager
-def _temporary(path: Path) -> Generator[Path]:
-    """Yields a new file in the folder of a path, and removes it. System errors name the path."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def new_file(path: str | os.PathLike[str]) -> Generator[TextIO]:
+    """Creates a file and its folder. Removes the file if an exception is raised."""
+    whole = os.path.abspath(utf8("csv", path))
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch()
-        yield temporary
+        os.makedirs(os.path.dirname(whole), exist_ok=True)
+        file = open(whole, "x", encoding="utf-8", newline="")
+    except FileExistsError as error:
+        raise ExistingFileError(
+            f"csv: {error.filename} already exists: choose another file"
+        ) from None
     except OSError as error:
-        got = f"{shortened(str(path))}: {error.strerror or error}"
+        got = f"{shortened(whole)}: {error.strerror}"
         raise invalid("csv", "a file that can be written", got) from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
+    try:
+        with file:
+            yield file
+    except BaseException:
+        os.unlink(whole)
+        raise
+
+
+def write(rows: Iterable[Row], file: TextIO) -> None:
+    """Writes a file of rows."""
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(field.name for field in fields(Row))
+    writer.writerows(astuple(row) for row in rows)

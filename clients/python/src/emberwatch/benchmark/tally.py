@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief.merit import MeritTally
+import emberwatch._native as _native
 from emberwatch.benchmark.rows import Row
 from emberwatch.envs.observations import cells_of
 from emberwatch.envs.settings import WorldSpec
@@ -22,8 +20,7 @@ class Tally:
     def __init__(self, spec: WorldSpec, n_worlds: int) -> None:
         self._spec: Final = spec
         target = 0 if spec.described is None else spec.described.target_state
-        grid = spec.height, spec.width
-        self._merit = MeritTally(n_worlds, grid, target=target)
+        self._merit = _native.MeritTally(n_worlds, spec.height, spec.width, target)
         self._reward = np.zeros(n_worlds)
         counts = np.zeros((4, n_worlds), np.int64)
         self._n_visited, self._n_visits, self._n_hits, self._n_fire = counts
@@ -51,27 +48,28 @@ class Tally:
         self._merit.update(
             visited,
             cells_of(robots).reshape(-1, n_robots, 2),
-            n_hits=worlds["n_hits"],
-            n_burning=worlds["n_target_cells"],
-            states=None if truths is None or not self._spec.described else truths[::n_robots],
+            worlds["n_hits"].astype(np.uint32),
+            worlds["n_target_cells"].astype(np.uint32),
+            None if truths is None or not self._spec.described else truths[::n_robots],
         )
 
-    def rows(self, seeds: Sequence[int], columns: dict[str, Any]) -> list[Row]:
-        """Returns the row of each world; `columns`: values that are equal in all rows."""
-        steps, visited = columns["steps"], self._n_visited.tolist()
-        return [
-            Row(
-                **columns,
-                world_seed=seed,
-                mean_reward=float(self._reward[index]) / steps,
-                mean_distinct_cells=visited[index] / steps,
-                hit_rate=int(self._n_hits[index]) / max(visited[index], 1),
-                mean_fire_cells=int(self._n_fire[index]) / steps,
-                mean_plan_millis=1e3 * self.seconds / steps / len(seeds),
-                brier="",
-                moves=self._spec.n_moves,
-                mean_repeated=1.0 - visited[index] / int(self._n_visits[index]),
-                **asdict(self._merit.merit(index)),
-            )
-            for index, seed in enumerate(seeds)
-        ]
+    def row(self, world: int, **columns: Any) -> Row:
+        """Returns the row of a world; `columns`: values that do not depend on its steps."""
+        steps, n_visited = columns["steps"], int(self._n_visited[world])
+        detected, n_burning, seen, distance, grid_seen = self._merit.merit(world)
+        return Row(
+            **columns,
+            mean_reward=float(self._reward[world]) / steps,
+            mean_distinct_cells=n_visited / steps,
+            hit_rate=int(self._n_hits[world]) / max(n_visited, 1),
+            mean_fire_cells=int(self._n_fire[world]) / steps,
+            mean_plan_millis=1e3 * self.seconds / steps / len(self._reward),
+            brier="",
+            moves=self._spec.n_moves,
+            mean_repeated=1.0 - n_visited / int(self._n_visits[world]),
+            steps_to_detection=detected,
+            burning_cells_at_detection=n_burning,
+            burning_seen_share=seen,
+            front_distance=distance,
+            grid_seen_share=grid_seen,
+        )

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.errors import invalid, repr_of
-from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
-from emberwatch.render.scenery import Scenery
+from emberwatch.render import Palette, Picture, ansi, rgb_array
+from emberwatch.render.screen import Screen
 
 #: The render modes of all environments.
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
@@ -27,7 +27,7 @@ class View:
                 "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr_of(render_mode)
             )
         self.mode: Final = render_mode
-        self._scenery: Final = Scenery.of(spec.airspace)
+        self._airspace: Final = spec.airspace
         self._palette: Final = Palette.of(spec.described or spec.n_observations)
         self._screen: Screen | None = None
 
@@ -39,7 +39,14 @@ class View:
         truth: NDArray[np.uint8] | None,
     ) -> Any:
         """Returns an image or a text, or shows it and returns None, depending on the mode."""
-        picture = Picture(frame, robots, self._palette, paths, truth, self._scenery)
+        picture = Picture(
+            frame=frame,
+            palette=self._palette,
+            robots=robots,
+            paths=paths,
+            truth=truth,
+            airspace=self._airspace,
+        )
         if self.mode == "rgb_array":
             return rgb_array(picture)
         if self.mode == "ansi":

@@ -1,94 +1,56 @@
 """Pictures of one world: the last frame, the path, and the hidden states if they are known.
 
 `rgb_array` returns an image, and `ansi` a text. `Screen` shows an image or a text to people, for
-``render_mode="human"``. The path of a single robot is dark or light, whichever has more contrast to
-the colours below it, and the robot is a circle in dark and light. Each robot of a team has its own
-colour.
+``render_mode="human"``. `film` draws recordings. The path of a single robot is dark or light,
+whichever has more contrast to the colours below it, and the robot is a circle in dark and light.
+Each robot of a team has its own colour. Hatches cover no-fly cells. A line surrounds the observed
+cells if robots see more than their path.
 """
 
-import contextlib
-import importlib
-import io
 import itertools
-import logging
-import os
-import sys
-import time
-from collections.abc import Iterator, Sequence
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.common.codes import UNOBSERVED
-from emberwatch.errors import invalid
 from emberwatch.model import Color
+from emberwatch.model.airspace import Airspace
 from emberwatch.render.palette import DARK, LIGHT, ROBOTS, mark_on
 from emberwatch.render.palette import Palette as Palette
-from emberwatch.render.scenery import Scenery
 
 _EDGE = (0xB4, 0xB4, 0xB4)
 _LONG_SIDE = 512  # default length of a panel's longer side, pixels; approximate
 _GAP = 8  # pixels between panels
-LEAST_LINE_SCALE = 3  # minimum side of a cell in pixels, to show its colour next to a line
+_LEAST_LINE_SCALE = 3  # minimum side of a cell in pixels, to show its colour next to a line
 _LEAST_RIM_SCALE = 12  # minimum side of a cell in pixels, for a rim around the line
 _TINT = 0.45  # share of white in visited cells that are too small for a line
 _LEAST_RADIUS, _MOST_RADIUS = 6.0, 14.0  # range of the radius of a robot's mark, pixels
+_LEAST_HATCH, _MOST_HATCH = 3, 10  # range of the distance between hatch lines, pixels
 _MOST_WIDE_ROWS = 32  # maximum number of rows that fit a terminal with one line for each
-_NOTHING = Scenery()
-_SYMBOLS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz+/"
-
-_LOG = logging.getLogger(__name__)
-
-Cells = NDArray[np.integer] | Sequence[tuple[int, int]]
-"""Visited cells (row, column) in order, shape (n, 2). Each is a neighbour of the previous one, or
-equal to it."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Picture:
-    """The checked contents of a picture."""
+    """The contents of a picture of one world."""
 
-    def __init__(
-        self,
-        frame: NDArray[np.uint8],
-        robots: Sequence[tuple[int, int]],
-        palette: Palette,
-        paths: Sequence[Cells] = (),
-        truth: NDArray[np.uint8] | None = None,
-        scenery: Scenery = _NOTHING,
-    ) -> None:
-        """Checks the contents.
-
-        Args:
-            frame: Observed values, 255 in unobserved cells, shape (H, W).
-            robots: The cell (row, column) of each robot to draw.
-            palette: The colours.
-            paths: The visited cells of each robot that flew, in order.
-            truth: The hidden states, shape (H, W); None: unknown.
-            scenery: The no-fly cells of the grid, and the sensor's range.
-        """
-        if frame.ndim != 2 or not frame.size:
-            raise invalid("frame", "shape (H, W)", frame.shape)
-        if truth is not None and truth.shape != frame.shape:
-            raise invalid("truth", f"shape {frame.shape}", truth.shape)
-        self.frame, self.robots, self.palette, self.truth = frame, robots, palette, truth
-        self.scenery = scenery
-        self.paths = [np.asarray(path, dtype=np.intp).reshape(-1, 2) for path in paths]
-        for what, places in (("robot", _cells(robots)), *(("path", path) for path in self.paths)):
-            off = ((places < 0) | (places >= frame.shape)).any(axis=1)
-            if off.any():
-                got = tuple(places[np.argmax(off)].tolist())
-                raise invalid(what, f"cells of a {frame.shape} grid", got)
-        for path in self.paths:
-            jumps = np.abs(np.diff(path, axis=0)).sum(axis=1) > 1
-            if jumps.any():
-                at = int(np.argmax(jumps))
-                got = [tuple(cell) for cell in path[at : at + 2].tolist()]
-                raise invalid("path", "consecutive cells to be neighbours", got)
+    frame: NDArray[np.uint8]
+    """Observed values, 255 in unobserved cells, shape (H, W)."""
+    palette: Palette
+    robots: Sequence[tuple[int, int]] = ()
+    """The cell (row, column) of each robot to draw."""
+    paths: Sequence[NDArray[np.intp]] = ()
+    """The visited cells (row, column) of each robot that flew, in order, shape (n, 2)."""
+    truth: NDArray[np.uint8] | None = None
+    """The hidden states, shape (H, W); None if they are unknown."""
+    airspace: Airspace = Airspace()  # noqa: RUF009
+    """The no-fly cells and the range of the sensor."""
 
     def color_of(self, robot: int) -> Color | None:
         """Returns the colour of a robot of a team; None for a single robot."""
-        return ROBOTS[divmod(robot, len(ROBOTS))[1]] if len(self.robots) > 1 else None
+        return ROBOTS[robot % len(ROBOTS)] if len(self.robots) > 1 else None
 
 
 def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8]:
@@ -106,167 +68,103 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
     Returns:
         An image of shape (height, width, 3): red, green, blue.
     """
-    palette = picture.palette
     height, width = picture.frame.shape
     if scale is None:  # an even number, unless cells are too small
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
-    if scale < 1:
-        raise invalid("scale", "at least 1 pixel", scale)
-    colors = palette.paint_frame(picture.frame)
-    if scale < LEAST_LINE_SCALE:
-        panels = [_enlarge(_tinted(colors, _visited(picture)), scale)]
-        picture.scenery.draw(panels[0], picture.frame, scale)
-    else:
-        seen = (picture.frame != UNOBSERVED)[:, :, None]
-        line = np.where(seen, palette.path, mark_on(palette.unobserved)).astype(np.uint8)
-        panels = [_enlarge(colors, scale)]
-        picture.scenery.draw(panels[0], picture.frame, scale)
-        for robot, path in enumerate(picture.paths):
-            _draw_path(panels[0], path, line, picture.color_of(robot), scale)
-    if picture.truth is not None:
-        panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
-        picture.scenery.draw(panels[1], picture.truth, scale)
+    panels = _panels(picture, scale)
     for panel in panels:
         for robot, cell in enumerate(picture.robots):
             _draw_robot(panel, cell, picture.color_of(robot), scale)
-    return _join(panels, axis=0 if width >= 2 * height else 1)
+    image = _join(panels, _GAP, axis=0 if width >= 2 * height else 1)
+    return np.pad(image, ((0, len(image) & 1), (0, image.shape[1] & 1), (0, 0)), mode="edge")
 
 
-def ansi(picture: Picture, *, color: bool = True) -> str:
+def ansi(picture: Picture) -> str:
     """Draws the picture as text for a terminal, hidden states on the right; no final line break.
 
-    With colour (24 bits), a cell is two characters. On grids of more than 32 rows, a cell is half a
-    character, and the path is a tint. Without colour, a cell is two ASCII characters. The first
-    character is the value as ``0-9A-Za-z+/``, or ``.`` for an unobserved cell. The second character
-    is ``@`` for a robot, ``*`` for a path, ``x`` for a no-fly cell, otherwise a space.
+    A character is two pixels in 24-bit colour, one above the other. A cell is 2 x 2 pixels, or on
+    grids of more than 32 rows one pixel. Paths are tints.
     """
-    palette, cells, robots = picture.palette, _visited(picture), _cells(picture.robots)
-    grids = [(picture.frame, picture.palette.paint_frame(picture.frame), cells)]
+    scale = 2 if len(picture.frame) <= _MOST_WIDE_ROWS else 1
+    panels = _panels(picture, scale)
+    for panel in panels:
+        for robot, (row, col) in enumerate(picture.robots):
+            cell = np.s_[row * scale : (row + 1) * scale, col * scale : (col + 1) * scale]
+            panel[cell] = picture.color_of(robot) or LIGHT
+    image = _join(panels, gap=2, axis=1).tolist()
+    return "\n".join(
+        itertools.starmap(_half_blocks, itertools.zip_longest(image[::2], image[1::2]))
+    )
+
+
+def _panels(picture: Picture, scale: int) -> list[NDArray[np.uint8]]:
+    """Draws the frame and, if they are known, the hidden states, without robots."""
+    palette, frame, no_fly = picture.palette, picture.frame, picture.airspace.no_fly
+    colors = palette.paint_frame(frame)
+    if scale < _LEAST_LINE_SCALE:
+        rows, cols = np.concatenate([np.empty((0, 2), np.intp), *picture.paths]).T
+        colors[rows, cols] = np.rint(colors[rows, cols] * (1 - _TINT) + 255 * _TINT)
+    panels = [_enlarge(colors, scale)]
+    if picture.airspace.radius > 0:
+        _draw_outline(panels[0], frame != UNOBSERVED, scale)
     if picture.truth is not None:
-        grids.append((picture.truth, palette.paint_truth(picture.truth), cells[:0]))
-    if not color:
-        panels = [_ascii_lines(values, _marks(picture, at, robots)) for values, _, at in grids]
-    elif len(picture.frame) <= _MOST_WIDE_ROWS:
-        panels = [_wide_lines(colors, _marks(picture, at, robots)) for _, colors, at in grids]
-    else:
-        panels = list[Iterator[str]]()
-        for values, colors, at in grids:
-            colors = _tinted(colors, at)
-            picture.scenery.draw(colors, values, 1)
-            panels.append(_half_lines(colors, robots))
-    return "\n".join("  ".join(lines).rstrip(" ") for lines in zip(*panels, strict=True))
+        panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
+    if no_fly is not None:
+        for panel in panels:
+            _draw_hatches(panel, no_fly, scale)
+    if scale >= _LEAST_LINE_SCALE:
+        seen = (frame != UNOBSERVED)[:, :, np.newaxis]
+        ink = np.where(seen, palette.path, mark_on(np.array(palette.unobserved)))
+        for robot, path in enumerate(picture.paths):
+            color = picture.color_of(robot)
+            _draw_path(panels[0], path, ink if color is None else np.full_like(ink, color), scale)
+    return panels
 
 
-class Screen:
-    """A window, or the terminal, that shows pictures to people.
-
-    A window needs pygame and a display (``DISPLAY``, ``WAYLAND_DISPLAY`` or ``SDL_VIDEODRIVER``);
-    pygame has one window per process. Without a window, pictures go to the standard output if it is
-    a terminal. Without a window or a terminal, a warning is logged once, and nothing is shown. If
-    the user closes the window, the program continues without pictures.
-    """
-
-    def __init__(self, *, title: str = "Emberwatch", fps: float = 0.0) -> None:
-        """Opens no window yet. `fps`: maximum number of pictures per second; 0: no limit."""
-        self._title, self._fps = title, fps
-        self._next: float | None = None
-        self._window: Any = None
-        self._pygame = _pygame_with_display()
-        #: Where pictures are shown.
-        self.kind: Literal["window", "terminal", "nothing"] = "window"
-        if self._pygame is None:
-            self.kind = "terminal" if sys.stdout.isatty() else "nothing"
-        if self.kind == "nothing":
-            _LOG.warning(
-                "render_mode 'human' shows nothing: it needs pygame and a display, or a terminal "
-                "as standard output; use 'rgb_array' or 'ansi' to get pictures"
-            )
-
-    def show(self, picture: Picture) -> None:
-        """Replaces the shown picture; waits first if the last one is too recent for `fps`."""
-        if self.kind == "window":
-            self._show_in_window(rgb_array(picture))
-        elif self.kind == "terminal":
-            clear = "\x1b[2J" if self._next is None else ""
-            sys.stdout.write(f"{clear}\x1b[H{ansi(picture)}\x1b[K\n\x1b[J")
-            sys.stdout.flush()
-        self._pace()
-
-    def close(self) -> None:
-        """Closes the window, if any. Later pictures are not shown. May be called again."""
-        # Another screen of this process may use the window by now.
-        if self._window is not None and self._pygame.display.get_surface() is self._window:
-            self._pygame.display.quit()
-        self._window, self.kind = None, "nothing"
-
-    def _show_in_window(self, image: NDArray[np.uint8]) -> None:
-        pygame, (height, width, _) = self._pygame, image.shape
-        if pygame.display.get_surface() is not self._window:
-            self._window = None
-        if self._window is None or self._window.get_size() != (width, height):
-            self._window = pygame.display.set_mode((width, height))
-            pygame.display.set_caption(self._title)
-        surface = pygame.image.frombuffer(image.tobytes(), (width, height), "RGB")
-        self._window.blit(surface, (0, 0))
-        pygame.display.flip()
-        if any(event.type == pygame.QUIT for event in pygame.event.get()):
-            self.close()
-
-    def _pace(self) -> None:
-        now = time.monotonic()
-        at = now if self._next is None else max(now, self._next)
-        if self.kind != "nothing":
-            time.sleep(at - now)
-            self._next = at + (1.0 / self._fps if self._fps > 0.0 else 0.0)
+def _enlarge(cells: NDArray[Any], scale: int) -> NDArray[Any]:
+    return cells.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _cells(places: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
-    return np.array(places, np.intp).reshape(-1, 2)
+def _draw_outline(image: NDArray[np.uint8], seen: NDArray[np.bool_], scale: int) -> None:
+    """Draws a line around the seen cells, over pixels of unseen cells."""
+    pixels = _enlarge(seen, scale)
+    near = pixels.copy()
+    for _ in range(max(1, scale // 12) if scale >= _LEAST_LINE_SCALE else 0):
+        grown = near.copy()
+        for to, of in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
+            grown[to] |= near[of]
+            grown[:, to] |= near[:, of]
+        near = grown
+    line = near & ~pixels
+    image[line] = mark_on(image[line])
 
 
-def _visited(picture: Picture) -> NDArray[np.intp]:
-    """Returns the cells of all paths."""
-    return np.concatenate([_cells([]), *picture.paths])
-
-
-def _tinted(colors: NDArray[np.uint8], cells: NDArray[np.intp]) -> NDArray[np.uint8]:
-    tinted, (rows, cols) = colors.copy(), cells.T
-    tinted[rows, cols] = np.rint(colors[rows, cols] * (1 - _TINT) + 255 * _TINT)
-    return tinted
-
-
-def _enlarge(colors: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
-    return colors.repeat(scale, axis=0).repeat(scale, axis=1)
+def _draw_hatches(image: NDArray[np.uint8], no_fly: NDArray[np.bool_], scale: int) -> None:
+    rows, cols = np.ogrid[: image.shape[0], : image.shape[1]]
+    period = min(max(scale, _LEAST_HATCH), _MOST_HATCH)
+    lines = _enlarge(no_fly, scale) & (np.remainder(rows + cols, period) < max(1, period // 4))
+    image[lines] = mark_on(image[lines])
 
 
 def _draw_path(
-    image: NDArray[np.uint8],
-    cells: NDArray[np.intp],
-    colors: NDArray[np.uint8],
-    color: Color | None,
-    scale: int,
+    image: NDArray[np.uint8], path: NDArray[np.intp], colors: NDArray[np.uint8], scale: int
 ) -> None:
-    """Draws a line through the cells' middles, with a square where it begins.
+    """Draws a line through the middles of a path's cells, with a square where it begins.
 
-    In each cell, the line has the colour that `colors` gives, dark or light. If `color` is given,
-    the whole line has this colour.
+    `colors` has the colour of the line in each cell, (H, W, 3).
     """
-    if not len(cells):
+    if not len(path):
         return
-    rims = np.where(colors[:, :, :1] == DARK[0], LIGHT, DARK).astype(np.uint8)
-    if color is not None:
-        colors, rims = np.full_like(colors, color), np.full_like(colors, mark_on(color))
     line = max(1, min(6, scale // 4))
     rim = 0 if scale < _LEAST_RIM_SCALE else max(1, line // 3)
-    ink, other = _enlarge(colors, scale), _enlarge(rims, scale)
-    middles = cells * scale + (scale - line) // 2
-    legs = list(zip(middles, middles[1:], strict=False))
-    begin = (middles[0], middles[0])
+    ink, other = _enlarge(colors, scale), _enlarge(mark_on(colors), scale)
+    middles = path * scale + (scale - line) // 2
+    legs, begin = list(itertools.pairwise(middles)), [(middles[0], middles[0])]
     for drawn, grow, source in (
         (legs, rim, other),
         (legs, 0, ink),
-        ([begin], rim + 2, ink),
-        ([begin], rim + 1, other),
+        (begin, rim + 2, ink),
+        (begin, rim + 1, other),
     ):
         for ends in drawn:
             top, left = np.maximum(np.minimum(*ends) - grow, 0)
@@ -289,75 +187,16 @@ def _draw_robot(
         window[distance <= radius * share] = ink
 
 
-def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
-    """Joins panels along an axis with gaps between them; rounds both sides up to even numbers."""
+def _join(panels: list[NDArray[np.uint8]], gap: int, *, axis: int) -> NDArray[np.uint8]:
     shape = list(panels[0].shape)
-    shape[axis] = _GAP
-    gap = np.full(shape, _EDGE, dtype=np.uint8)
-    image = np.concatenate([part for panel in panels for part in (gap, panel)][1:], axis=axis)
-    height, width, _ = image.shape
-    return np.pad(image, ((0, height & 1), (0, width & 1), (0, 0)), mode="edge")
+    shape[axis] = gap
+    edge = np.full(shape, _EDGE, dtype=np.uint8)
+    return np.concatenate([part for panel in panels for part in (edge, panel)][1:], axis=axis)
 
 
-def _marks(picture: Picture, cells: NDArray[np.intp], robots: NDArray[np.intp]) -> NDArray[np.str_]:
-    marks = np.full(picture.frame.shape, " ")
-    if picture.scenery.no_fly is not None:
-        marks[picture.scenery.no_fly] = "x"
-    marks[tuple(cells.T)] = "*"
-    marks[tuple(robots.T)] = "@"
-    return marks
-
-
-def _ascii_lines(values: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[str]:
-    symbols = np.full(256, ".")
-    symbols[: len(_SYMBOLS)] = list(_SYMBOLS)
-    for line in np.stack([symbols[values], marks], axis=-1):
-        yield "".join(line.ravel().tolist())
-
-
-def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[str]:
-    """Yields lines in which each cell is two characters on a background of its colour."""
-    wide = {" ": "  ", "*": "··", "@": "()", "x": "xx"}
-    for line, line_marks in zip(colors.tolist(), marks.tolist(), strict=True):
-        cells: list[tuple[str, str]] = []
-        for (red, green, blue), mark in zip(line, line_marks, strict=True):
-            ink, _, _ = mark_on((red, green, blue))
-            cells.append((f"38;2;{ink};{ink};{ink};48;2;{red};{green};{blue}", wide[mark]))
-        yield _styled(cells)
-
-
-def _half_lines(colors: NDArray[np.uint8], robots: NDArray[np.intp]) -> Iterator[str]:
-    """Yields lines for two rows of cells: the upper row as foreground, the lower as background."""
-    colors = colors.copy()
-    colors[tuple(robots.T)] = LIGHT
-    for row in range(0, len(colors), 2):
-        cells: list[tuple[str, str]] = []
-        for col, (red, green, blue) in enumerate(colors[row].tolist()):
-            behind = "49"
-            if row + 1 < len(colors):
-                behind = "48;2;{};{};{}".format(*colors[row + 1, col].tolist())
-            cells.append((f"38;2;{red};{green};{blue};{behind}", "▀"))
-        yield _styled(cells)
-
-
-def _styled(cells: list[tuple[str, str]]) -> str:
-    """Joins texts with their style, which is written only where it changes."""
-    runs = itertools.groupby(cells, key=lambda cell: cell[0])
-    texts = (f"\x1b[{style}m" + "".join(text for _, text in run) for style, run in runs)
-    return "".join(texts) + "\x1b[0m"
-
-
-def _pygame_with_display() -> Any:
-    """Returns pygame with an initialised display; None if there is no display or no pygame."""
-    if not any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")):
-        return None
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints its version
-            pygame = importlib.import_module("pygame")
-    except ImportError:
-        return None
-    try:
-        pygame.display.init()
-    except pygame.error:
-        return None
-    return pygame
+def _half_blocks(upper: list[list[int]], lower: list[list[int]] | None) -> str:
+    """Returns a line of text: upper pixels as foreground, lower ones, if any, as background."""
+    styles = ["38;2;{};{};{};".format(*color) for color in upper]
+    behind = ["48;2;{};{};{}".format(*color) for color in lower or ()] or ["49"] * len(upper)
+    runs = itertools.groupby(f"{front}{back}" for front, back in zip(styles, behind, strict=True))
+    return "".join(f"\x1b[{style}m" + "▀" * len(list(run)) for style, run in runs) + "\x1b[0m"

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch._native import MAX_VALUES
-from emberwatch.common.codes import UNOBSERVED
-from emberwatch.errors import invalid
 from emberwatch.model import Color, Description, color_from_hex
 
 DARK: Final[Color] = (0x14, 0x14, 0x14)
@@ -29,9 +27,7 @@ _ROBOTS = ("5EE6C8", "FF9AD5", "B9F04A", "8FD0FF", "FFA64D", "C9A8FF", "F5F09A",
 _GREYS = (0x30, 0x60, 0x98, 0xE2)  # candidates for unobserved cells
 ROBOTS: Final[tuple[Color, ...]] = tuple(map(color_from_hex, _ROBOTS))
 """The colours of the robots of a team, repeated in turn."""
-_APART = (
-    3 * 60 * 60
-)  # squared distance at which two colours can be distinguished, as in the Rust figures
+_APART = 3 * 60 * 60  # squared distance at which two colours can be distinguished
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,35 +56,32 @@ class Palette:
             # Enough colours for any number of states.
             states = tuple(map(color_from_hex, islice(cycle(_COLORS), MAX_VALUES)))
             observations = states[:source]
+        lights = _luminances(np.array(observations))
         return cls(
             states=states,
             observations=observations,
             unobserved=_grey_unlike((*states, *observations), _GREYS[:: -1 if on_paper else 1]),
-            path=mark_on(*observations),
+            path=DARK if lights.min() * lights.max() > _MIDDLE else LIGHT,
         )
 
     def paint_frame(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Returns the colours (H, W, 3) of a frame (H, W)."""
-        return _paint(frame, {**dict(enumerate(self.observations)), UNOBSERVED: self.unobserved})
+        colors = np.full((256, 3), self.unobserved, np.uint8)
+        colors[: len(self.observations)] = self.observations
+        return colors[frame]
 
     def paint_truth(self, truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Returns the colours (H, W, 3) of hidden states (H, W)."""
-        return _paint(truth, dict(enumerate(self.states)))
+        return np.array(self.states, np.uint8)[truth]
 
 
-def mark_on(*colors: Color) -> Color:
-    """Returns dark or light, whichever has the larger minimum contrast to the given colours.
+def mark_on(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Returns dark or light for each colour, (..., 3): whichever has more contrast to it.
 
     Contrast ratio and luminance are defined in the Web Content Accessibility Guidelines 2.1.
     """
-    lights = _luminances(np.array(colors))
-    return DARK if lights.min() * lights.max() > _MIDDLE else LIGHT
-
-
-def mark_on_each(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Returns `mark_on` for each of many colours, shape (n, 3)."""
     is_light = _luminances(colors) ** 2 > _MIDDLE
-    return np.where(is_light[:, None], DARK, LIGHT).astype(np.uint8)
+    return np.where(is_light[..., np.newaxis], DARK, LIGHT).astype(np.uint8)
 
 
 def _luminances(colors: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -96,17 +89,6 @@ def _luminances(colors: NDArray[np.integer]) -> NDArray[np.float64]:
 
 
 _MIDDLE = _luminances(np.array([DARK, LIGHT])).prod()
-
-
-def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.uint8]:
-    table = np.zeros((256, 3), dtype=np.uint8)
-    for value, color in colors.items():
-        table[value] = color
-    unknown = np.isin(values, list(colors), invert=True)
-    if unknown.any():
-        got = int(values[unknown][0])
-        raise invalid("picture", f"values in {sorted(colors)}", got)
-    return table[values]
 
 
 def _grey_unlike(colors: tuple[Color, ...], greys: tuple[int, ...]) -> Color:
