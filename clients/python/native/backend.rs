@@ -8,13 +8,12 @@ use emberwatch_messages::backend::Backend;
 use emberwatch_messages::limits::threads::spawn;
 use emberwatch_model::Model;
 use emberwatch_model::hazards::Hazards;
-use emberwatch_model::settings::{SettingError, Settings as _, WorldSettings};
+use emberwatch_model::settings::{SettingError, Settings as _};
 use emberwatch_sim::config::{Checked, ServerConfig, model_named};
 use emberwatch_sim::embedded::{Embedded, wait_for};
 use emberwatch_sim::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
-use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
@@ -75,19 +74,10 @@ impl CheckedSettings {
         })
     }
 
-    /// All settings as JSON, with every default filled in.
+    /// The answer to `hello` of a server with these settings, as JSON.
     #[getter]
-    fn settings(&self) -> String {
-        serde_json::to_string(&self.checked.config).expect("invariant: settings serialise")
-    }
-
-    /// The text of the model file, with the maps from other files included; for recorded states, of their description.
-    #[getter]
-    fn description(&self) -> String {
-        match &self.checked.recorded {
-            Some(states) => states.description.clone(),
-            None => text_of(&self.checked.model),
-        }
+    fn info(&self) -> String {
+        serde_json::to_string(&self.checked.info()).expect("invariant: replies serialise")
     }
 
     /// `None` if the settings have no task.
@@ -156,13 +146,6 @@ impl CheckedSettings {
         let given = settings.into();
         Ok(Self { given, checked })
     }
-}
-
-/// Returns the range of each setting of worlds, by name; `None` unless the setting is a number.
-#[pyfunction]
-pub fn world_settings() -> BTreeMap<&'static str, Option<(i128, i128)>> {
-    let settings = WorldSettings::settings().into_iter();
-    settings.map(|it| (it.name, it.range)).collect()
 }
 
 /// Reads settings again for a copy in another process. Refuses files that have changed since `fingerprint` was made.

@@ -47,7 +47,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     #[cfg(unix)]
     fork::register(module)?;
     module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
-    module.add_function(wrap_pyfunction!(moves::moves, module)?)?;
     module.add_class::<answer::Answer>()?;
     module.add_function(wrap_pyfunction!(answer::columns, module)?)?;
     module.add_class::<connection::Connection>()?;
@@ -68,7 +67,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<backend::CheckedSettings>()?;
     module.add_function(wrap_pyfunction!(backend::model_text, module)?)?;
     module.add_function(wrap_pyfunction!(backend::read_again, module)?)?;
-    module.add_function(wrap_pyfunction!(backend::world_settings, module)?)?;
     module.add_function(wrap_pyfunction!(prior::simulated_prior, module)?)?;
     module.add("RECOMMENDED", RECOMMENDED.name)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;

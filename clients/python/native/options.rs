@@ -1,13 +1,12 @@
 //! Options for Python: beliefs about worlds of one robot each, and the plans that a learner chooses from.
 
 use crate::airspace::Given;
-use crate::connection::checked;
 use crate::errors::warn;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
 use crate::origin::decoded;
 use crate::owned::Owned;
-use crate::planned_worlds::{Observed, PlannedWorlds, Watched};
+use crate::planned_worlds::{Observed, PlannedWorlds};
 use crate::prior::first_belief;
 use crate::refusal::{invalid, refused};
 use emberwatch_acting::beliefs::{self, BeliefKind};
@@ -70,8 +69,7 @@ pub struct Options {
 #[pymethods]
 impl Options {
     /// Checks all arguments. Beliefs exist only after [`Self::begin`]. `checkpoint` is a path, for errors, and the bytes
-    /// of its file. `watched` is the instance in which beliefs are published, and the number that the first of these
-    /// worlds has in that instance.
+    /// of its file.
     #[new]
     fn new(
         py: Python<'_>,
@@ -80,7 +78,6 @@ impl Options {
         estimator: Option<&str>,
         checkpoint: Option<(String, PyBackedBytes)>,
         prior: &str,
-        watched: Option<(String, u32)>,
     ) -> PyResult<Self> {
         let estimator = estimator.map(beliefs::of_options).transpose();
         let estimator =
@@ -111,21 +108,11 @@ impl Options {
         } else {
             Prior::Initial
         };
-        let watched = watched.map(|(instance, first_world)| {
-            Ok::<_, PyErr>(Watched {
-                instance: checked(py, &instance)?,
-                first_world,
-                feed: None,
-            })
-        });
         Ok(Self {
             estimator: setup.estimator().name.into(),
             first: (first, setup.model().clone()),
             prior: OnceLock::new(),
-            worlds: Owned::new(
-                "options",
-                PlannedWorlds::new(setup, n_worlds, watched.transpose()?),
-            ),
+            worlds: Owned::new("options", PlannedWorlds::new(setup, n_worlds)),
         })
     }
 
@@ -178,29 +165,26 @@ impl Options {
             worlds: &worlds,
             results: results.as_slice()?,
             frames: Some(frames.as_slice()?),
-            flown: None,
         };
         let seen = self.worlds.with(py, |it| it.update(observed, false));
         seen?.map_err(|error| raise(py, &error))
     }
 
     /// Updates beliefs with the current step of `worlds`, then plans all options. If `frames` is `None`, the beliefs
-    /// already include this step. `flown` lists the options that the robots have just flown. Returns features
-    /// `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds.
+    /// already include this step. Returns features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of
+    /// all worlds.
     fn plan<'py>(
         &self,
         py: Python<'py>,
         worlds: Vec<usize>,
         results: PyReadonlyArray1<'py, u8>,
         frames: Option<PyReadonlyArray3<'py, u8>>,
-        flown: Option<Vec<usize>>,
     ) -> PyResult<Plans<'py>> {
         let frames = frames.as_ref().map(|frames| frames.as_slice());
         let observed = Observed {
             worlds: &worlds,
             results: results.as_slice()?,
             frames: frames.transpose()?,
-            flown: flown.as_deref(),
         };
         let plans = self.worlds.with(py, |it| {
             it.update(observed, true)?;

@@ -1,16 +1,13 @@
-//! Single-robot worlds with their beliefs and plans: belief updates, planning, and publishing to observers.
+//! Single-robot worlds with their beliefs and the plans of all options.
 
 use crate::answer::RESULT_BYTES;
 use crate::origin::is_short;
 use crate::threads::{Pool, Threads};
-use crate::wire::{Feed, View};
 use anyhow::{Context, Result, ensure};
 use emberwatch_acting::options::{OptionAgent, OptionSetup, Shown};
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
-use emberwatch_messages::agent_belief::Intent;
-use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::payload::WORLD_BYTES;
 use emberwatch_model::Frame;
@@ -23,16 +20,6 @@ pub struct PlannedWorlds {
     /// `None` before a world's first episode.
     worlds: Vec<Option<OptionAgent>>,
     threads: Pool,
-    watched: Option<Watched>,
-}
-
-/// The channel on which beliefs are published to observers.
-pub struct Watched {
-    pub instance: Instance,
-    /// The instance's number of the first of these worlds.
-    pub first_world: u32,
-    /// `None` until the first frame, which opens the channel.
-    pub feed: Option<Feed>,
 }
 
 /// The observations of some worlds, one row per world.
@@ -43,42 +30,22 @@ pub struct Observed<'a> {
     pub results: &'a [u8],
     /// The frames, `[n, H, W]`; `None` if the beliefs already include them.
     pub frames: Option<&'a [u8]>,
-    /// The option that each robot has just flown.
-    pub flown: Option<&'a [usize]>,
 }
 
-/// A row of [`Observed`].
-struct Row<'a> {
+/// A world that is updated: its belief and plans, and its row of [`Observed`].
+struct WorldWork<'a> {
+    planned: &'a mut OptionAgent,
     world: WorldResult,
     robot: RobotResult,
     frame: Option<&'a [u8]>,
-    flown: Option<usize>,
-}
-
-/// The work on one world: its observation, and whether to plan and to publish.
-struct WorldWork<'a> {
-    index: usize,
-    planned: &'a mut OptionAgent,
-    observed: Row<'a>,
-    plans: bool,
-    is_shown: bool,
-}
-
-/// The data to publish about a world: its belief after the frame, and the plan.
-struct Outlook {
-    index: usize,
-    world: WorldResult,
-    belief: Belief,
-    intent: Intent,
 }
 
 impl PlannedWorlds {
-    pub fn new(setup: OptionSetup, n_worlds: usize, watched: Option<Watched>) -> Self {
+    pub fn new(setup: OptionSetup, n_worlds: usize) -> Self {
         Self {
             setup,
             worlds: (0..n_worlds).map(|_| None).collect(),
             threads: Pool::default(),
-            watched,
         }
     }
 
@@ -112,40 +79,26 @@ impl PlannedWorlds {
         Ok(())
     }
 
-    /// Updates beliefs with frames. If `plans` is set, also plans all options.
+    /// Updates beliefs with frames. If `plans` is set, also plans all options. A world whose belief refuses its frame
+    /// stays unchanged.
     ///
     /// # Errors
     /// If the arrays differ in length, a world's number is out of range, or a belief refuses its frame.
     pub fn update(&mut self, observed: Observed<'_>, plans: bool) -> Result<()> {
         let n_cells = self.setup.shape().n_cells();
         observed.check(n_cells)?;
-        let is_new = plans && observed.frames.is_some();
-        let shown = self.shown(observed.worlds.len() * usize::from(is_new));
         let rows = self.rows(observed.worlds)?;
         let Self {
             setup,
             threads,
             worlds,
-            ..
         } = self;
-        let tasks = worlds.iter_mut().zip(rows).enumerate();
-        let tasks = tasks.filter_map(|(index, (planned, row))| {
-            let (planned, row) = (planned.as_mut()?, row?);
-            Some(WorldWork {
-                index,
-                planned,
-                observed: observed.row(row, n_cells),
-                plans,
-                is_shown: shown.contains(&row),
-            })
-        });
-        let tasks: Vec<WorldWork<'_>> = tasks.collect();
-        let done = threads.work(is_short(setup.estimator(), tasks.len()), |threads| {
-            work_on(setup, tasks, threads)
-        });
-        let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
-        self.show(outlooks.into_iter().flatten());
-        Ok(())
+        let works = worlds.iter_mut().zip(rows);
+        let works = works
+            .filter_map(|(planned, row)| Some(observed.work(planned.as_mut()?, row?, n_cells)));
+        let works: Vec<WorldWork<'_>> = works.collect();
+        let is_short = is_short(setup.estimator(), works.len());
+        threads.work(is_short, |threads| update(setup, works, plans, threads))
     }
 
     /// Returns, for each world here, its index in `worlds`; `None` if it is not listed there.
@@ -179,42 +132,6 @@ impl PlannedWorlds {
         }
         (features, paths)
     }
-
-    /// Returns which of the rows 0 to `n_worlds - 1` to publish now. The first call opens the channel.
-    fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
-        let begun = self.worlds.iter().flatten().next();
-        let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
-            return Vec::new();
-        };
-        let belief = || begun.agent().belief().probabilities();
-        let feed = watched
-            .feed
-            .get_or_insert_with(|| Feed::open(&watched.instance, belief()));
-        if n_worlds == 0 {
-            Vec::new()
-        } else {
-            feed.due(n_worlds)
-        }
-    }
-
-    fn show(&mut self, outlooks: impl Iterator<Item = Outlook>) {
-        let Some(watched) = &mut self.watched else {
-            return;
-        };
-        for outlook in outlooks {
-            let world = watched.first_world + outlook.index as u32;
-            let view = View {
-                world,
-                robots: world..world + 1,
-                result: &outlook.world,
-                belief: outlook.belief.probabilities(),
-                intent: outlook.intent,
-            };
-            if let Some(feed) = &mut watched.feed {
-                feed.show(&view);
-            }
-        }
-    }
 }
 
 impl<'a> Observed<'a> {
@@ -222,71 +139,58 @@ impl<'a> Observed<'a> {
         let n_worlds = self.worlds.len();
         ensure!(
             self.results.len() == n_worlds * RESULT_BYTES
-                && self.frames.is_none_or(|it| it.len() == n_worlds * n_cells)
-                && self.flown.is_none_or(|it| it.len() == n_worlds),
-            "options: expected a result, a frame and an option for each of {n_worlds} worlds, got other lengths"
+                && self.frames.is_none_or(|it| it.len() == n_worlds * n_cells),
+            "options: expected a result and a frame for each of {n_worlds} worlds, got other lengths"
         );
         Ok(())
     }
 
-    fn row(&self, row: usize, n_cells: usize) -> Row<'a> {
+    fn work(&self, planned: &'a mut OptionAgent, row: usize, n_cells: usize) -> WorldWork<'a> {
         let result = &self.results[row * RESULT_BYTES..][..RESULT_BYTES];
         let (world, robot) = result.split_at(WORLD_BYTES);
-        Row {
+        WorldWork {
+            planned,
             world: bytemuck::pod_read_unaligned(world),
             robot: bytemuck::pod_read_unaligned(robot),
             frame: self.frames.map(|it| &it[row * n_cells..][..n_cells]),
-            flown: self.flown.map(|it| it[row]),
         }
     }
 }
 
-/// Corrects and predicts the beliefs, then plans. Worlds with a refused frame stay unchanged.
-fn work_on(
+/// Corrects and predicts the beliefs, then plans.
+fn update(
     setup: &OptionSetup,
-    mut tasks: Vec<WorldWork<'_>>,
+    mut works: Vec<WorldWork<'_>>,
+    plans: bool,
     threads: Threads,
-) -> Vec<Result<Option<Outlook>>> {
-    let seen = threads.each(&mut tasks, |task| task.see(setup));
-    let fits = tasks
-        .into_iter()
-        .zip(&seen)
-        .filter(|(_, seen)| seen.is_ok());
-    let mut tasks: Vec<_> = fits.map(|(task, _)| task).collect();
-    let new = tasks
-        .iter_mut()
-        .filter(|task| task.observed.frame.is_some());
-    let new = new.map(|task| &mut *task.planned);
+) -> Result<()> {
+    let seen = threads.each(&mut works, |work| work.see(setup));
+    let fits = works.into_iter().zip(&seen);
+    let mut works: Vec<_> = fits
+        .filter_map(|(work, seen)| seen.is_ok().then_some(work))
+        .collect();
+    let new = works.iter_mut().filter(|work| work.frame.is_some());
+    let new = new.map(|work| &mut *work.planned);
     match threads {
         Threads::Several => OptionAgent::predict_all(new),
         Threads::One => new.for_each(|planned| OptionAgent::predict_all([planned])),
     }
-    let planning = tasks.into_iter().filter(|task| task.plans);
-    threads.each(planning, |task| {
-        task.planned.plan(task.observed.robot.cell())
-    });
-    seen
+    if plans {
+        threads.each(works, |work| work.planned.plan(work.robot.cell()));
+    }
+    seen.into_iter().collect()
 }
 
 impl WorldWork<'_> {
     /// Corrects the belief with the frame, if there is one.
-    fn see(&mut self, setup: &OptionSetup) -> Result<Option<Outlook>> {
-        let Some(frame) = self.observed.frame else {
-            return Ok(None);
+    fn see(&mut self, setup: &OptionSetup) -> Result<()> {
+        let Some(frame) = self.frame else {
+            return Ok(());
         };
-        let intent = self
-            .is_shown
-            .then(|| self.planned.intent(self.observed.flown));
         let n_observations = setup.model().n_observations();
         self.planned.see(&Shown {
             frame: Frame::from_bytes(setup.shape(), n_observations, frame)?,
-            reward: (self.observed.world.step > 0).then_some(self.observed.robot.reward),
-        })?;
-        Ok(intent.map(|intent| Outlook {
-            index: self.index,
-            world: self.observed.world,
-            belief: self.planned.agent().belief().clone(),
-            intent,
-        }))
+            reward: (self.world.step > 0).then_some(self.robot.reward),
+        })
     }
 }

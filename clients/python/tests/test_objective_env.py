@@ -15,7 +15,7 @@ import oracle
 import pytest
 from environments import OBJECTIVE, assert_same, closed_later, rollout
 from failures import fails, refuses
-from processes import eventually, find, server
+from processes import find, server
 
 import emberwatch
 from emberwatch import belief, errors
@@ -141,25 +141,6 @@ def test_the_next_agent_continues_from_the_same_belief(
     assert_same(found, seen)
 
 
-def test_beliefs_are_published_to_readers() -> None:
-    started = server(worlds=3)
-    envs = make_vec(2, instance=started.instance, world=1)
-    envs.reset(seed=1000)
-    with emberwatch.client.observer.OutlookReader(started.instance) as reader:
-        expected = {(1, "exploit"), (2, "entropy")}
-
-        def is_shown() -> bool:
-            envs.step(np.array([0, 3]))
-            outlook = reader.receive(0.0)
-            if outlook is not None:
-                assert (outlook.policy, outlook.belief_from) == ("options", belief.RECOMMENDED)
-                assert outlook.robots == range(outlook.world, outlook.world + 1)
-                expected.discard((outlook.world, outlook.objective))
-            return not expected
-
-        assert eventually(is_shown)
-
-
 def test_a_checkpoint_that_does_not_fit_is_refused(checkpoints: Path, tmp_path: Path) -> None:
     model = tmp_path / "model.toml"
     model.write_text(oracle.with_fourth_observation(Path(environments.LIVELY).read_text()))
@@ -196,7 +177,7 @@ def test_resume_after_an_unfinished_step_has_all_frames(
     seen = other.step(np.zeros(other.action_space.shape, int))[0]
     with monkeypatch.context() as patched:
         # Interrupts after the world's step, before the belief's update.
-        patched.setattr(one._plans, "see", interrupted)
+        patched.setattr(one._plans, "update", interrupted)
         with pytest.raises(KeyboardInterrupt):
             decide(one)
     with fails("interrupted"):

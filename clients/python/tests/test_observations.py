@@ -144,7 +144,7 @@ def test_rows_of_different_steps_join_together(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(
             Observations,
             "update",
-            lambda self, moved, frames: (updates.append(moved), update(self, moved, frames)),
+            lambda self, moved, *seen: (updates.append(moved), update(self, moved, *seen)),
         )
         second = make_vec(3, instance=instance, observation=OF_PATHS)
         assert_same(second.reset(options={"resume": True})[0], last)

@@ -185,8 +185,8 @@ def test_a_team_is_drawn_as_a_whole() -> None:
 def test_invalid_team_keywords_are_named() -> None:
     rows: list[tuple[dict[str, Any], str]] = [
         ({"action": "fly"}, "action: expected 'move' or 'path', got 'fly'"),
-        ({"robots": 0}, "robots: expected an integer within 1 to 64, got 0"),
-        ({"robots": 65}, "robots: expected an integer within 1 to 64, got 65"),
+        ({"robots": 0}, "robots: expected 1 to 64, got 0"),
+        ({"robots": 65}, "robots: expected 1 to 64, got 65"),
         ({"robot": 1}, "robot: expected"),
         ({"reward": "all"}, "reward: expected one of 'share', 'team', 'marginal', 'move'"),
         ({"action": "path", "reward": "move"}, "reward: expected one of 'share', 'team', 'marg"),

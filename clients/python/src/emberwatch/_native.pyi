@@ -74,12 +74,6 @@ MAX_VALUES: int
 def built_in(kind: Literal["models", "tasks", "states"]) -> dict[str, str]:
     """Returns the texts of built-in files by name; `states` are descriptions of recorded states."""
 
-def world_settings() -> dict[str, tuple[int, int] | None]:
-    """Returns the range of each setting of worlds, by its name in `config/server.toml`.
-
-    The range is None unless the setting is a number.
-    """
-
 def explain(status: int, detail: int) -> tuple[str, str] | None:
     """Returns the name and the message of a status code; None if the code is not a refusal."""
 
@@ -100,12 +94,8 @@ class CheckedSettings:
         """Returns the same settings with another number of worlds."""
 
     @property
-    def settings(self) -> str:
-        """All settings with their defaults, as JSON."""
-
-    @property
-    def description(self) -> str:
-        """Text of the model file with all maps, or of the description of recorded states."""
+    def info(self) -> str:
+        """The answer to `hello` of a server with these settings, as JSON."""
 
     @property
     def task(self) -> tuple[str, int, int, int, int, int, str, int] | None:
@@ -190,9 +180,6 @@ def columns(results: NDArray[np.uint8], pays: int) -> _Columns:
     `(n,)` each; cells, `(n, 2)`; and whether any episode is over. `pays`: as in `Answer.numbers`.
     """
 
-def moves(given: ArrayLike, n_robots: int, n_moves: int) -> NDArray[np.uint8] | None:
-    """Checks paths; returns them as bytes, `(n_robots, n_moves)`, or None as `Lease.step` does."""
-
 class Connection:
     """A connection to a server, or worlds in this process. Calls of several threads take turns."""
 
@@ -248,12 +235,8 @@ class Options:
         estimator: str | None,
         checkpoint: tuple[str, bytes] | None,
         prior: str,
-        watched: tuple[str, int] | None,
     ) -> None:
-        """Checks all arguments. `checkpoint`: the path, for errors, and the bytes of the file.
-
-        `watched`: instance on which beliefs are published, and the number of world 0 there.
-        """
+        """Checks all arguments. `checkpoint`: the path, for errors, and the bytes of the file."""
 
     @property
     def estimator(self) -> str:
@@ -276,11 +259,10 @@ class Options:
         worlds: list[int],
         results: NDArray[np.uint8],
         frames: NDArray[np.uint8] | None,
-        flown: list[int] | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Updates beliefs with the current step, unless `frames` is None, then plans.
 
-        `results`: bytes of `wire.RESULT_DTYPE`. `flown`: the option flown in each world.
+        `results`: bytes of `wire.RESULT_DTYPE`.
 
         Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
         worlds, as new arrays.

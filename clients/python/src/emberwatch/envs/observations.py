@@ -89,8 +89,8 @@ class Observations:
             for name in names
             if name in channels
         }
-        #: Whether the last frame alone determines the observation.
-        self._has_no_memory = not has_memory(names)
+        #: Whether observations depend on frames before the last one.
+        self.has_memory = has_memory(names)
         self._image = np.empty(0, np.uint8)
         # One row for each observed value, and a last row for unobserved cells.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
@@ -108,19 +108,21 @@ class Observations:
         have an entry for every row.
         """
         steps = results["world"]["step"]
-        joined = begun & (steps > 0) & (not self._has_no_memory)
+        joined = begun & (steps > 0) & self.has_memory
         self._reset(begun & ~joined, frames)
         rows = np.flatnonzero(joined).tolist()
         each = [self._until(int(steps[row]), row, frames) for row in rows]
-        show, seen = self._reset, np.zeros_like(frames)
+        seen = np.zeros_like(frames)
         # The rows join together, because each update takes the time of all rows.
-        for shown in zip_longest(*each):
+        for number, shown in enumerate(zip_longest(*each)):
             moved = np.zeros(self._n_rows, np.bool_)
             for row, frame in zip(rows, shown, strict=True):
                 if frame is not None:
                     seen[row], moved[row] = frame, True
-            show(moved, seen)
-            show = self.update
+            if number == 0:
+                self._reset(moved, seen)
+            else:
+                self.update(moved, results, seen)
 
     def _until(self, step: int, row: int, frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
         """Yields the frames of a row that are still kept, then its frame of the step."""
@@ -141,10 +143,10 @@ class Observations:
             self._belief.predict(begun)
         self._show(begun)
 
-    def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+    def update(
+        self, moved: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
+    ) -> None:
         """Updates the rows `moved` with a step; `frames` has a frame for every row."""
-        if self._has_no_memory:
-            return
         if self._last_seen is not None:
             self._last_seen.update(moved, frames)
         if self._belief is not None:
@@ -167,7 +169,7 @@ class Observations:
             "moves": [] if flights is None else [flights.made(row) for row in range(self._n_rows)],
         }
 
-    def restore(self, memory: dict[str, Any]) -> None:
+    def restore(self, memory: dict[str, Any], results: NDArray[np.void]) -> None:
         """Continues from `memory`; the environment has begun the paths of all robots again."""
         self._belief = memory["belief"]
         if self._last_seen is not None:
