@@ -326,17 +326,6 @@ def test_files_are_read_once(
         pickle.loads(pickled)
 
 
-def test_a_copy_in_another_process_refuses_changed_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_files(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    pickled = pickle.dumps(of_files("model", "path"))
-    (tmp_path / "model.toml").write_text(Model.named("wildfire").toml)
-    with refuses("the file of their task, model or states has changed since they were made"):
-        pickle.loads(pickled)
-
-
 def test_a_model_is_given_as_such_or_as_text() -> None:
     model = Model.named("wildfire-small")
     worlds = {**SMALL, "model": "wildfire-small"}

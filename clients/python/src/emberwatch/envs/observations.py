@@ -165,15 +165,13 @@ class Observations:
         flights = self._flights
         return {
             "belief": self._belief,
-            "last_seen": None if self._last_seen is None else self._last_seen.memory(),
+            "last_seen": self._last_seen,
             "moves": [] if flights is None else [flights.made(row) for row in range(self._n_rows)],
         }
 
     def restore(self, memory: dict[str, Any], results: NDArray[np.void]) -> None:
         """Continues from `memory`; the environment has begun the paths of all robots again."""
-        self._belief = memory["belief"]
-        if self._last_seen is not None:
-            self._last_seen.restore(memory["last_seen"])
+        self._belief, self._last_seen = memory["belief"], memory["last_seen"]
         self._show(np.ones(self._n_rows, np.bool_))
         # The moves of the incomplete paths are made again.
         made: list[NDArray[np.uint8]] = memory["moves"]

@@ -39,16 +39,6 @@ class Plans:
             raise InvalidArgumentError(
                 "robots, robot: expected worlds of one robot, as options are planned for one robot"
             )
-        given: dict[str, object] = {
-            "estimator": estimator,
-            "prior": prior,
-            "checkpoint": checkpoint,
-        }
-        for name, value in given.items():
-            kinds = (str, PathLike) if name == "checkpoint" else str
-            if not isinstance(value, kinds) and (name == "prior" or value is not None):
-                expected = "a path" if name == "checkpoint" else "a name"
-                raise invalid(name, expected, repr_of(value))
         self._session = session
         path = None if checkpoint is None else utf8("checkpoint", checkpoint)
         # The bytes, because the file may change or move before a reset makes the beliefs again.
@@ -124,7 +114,9 @@ class Plans:
         worlds = list(range(len(memory)))
         native.start_episodes(worlds, results["world"]["seed"].tolist())
         for world, left in enumerate(memory):
-            assert left is not None and native.take_over(world, *left)
+            if left is None or not native.take_over(world, *left):
+                expected = f"a state of the estimator {self.estimator!r}"
+                raise invalid("restore_state", expected, "another")
         self.features, self._paths = native.plan(worlds, results.view(np.uint8), None)
 
     def close(self, results: NDArray[np.void] | None) -> None:

@@ -79,7 +79,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._session, self._spec = session, session.spec
         spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
         self._observations = observations
-        self._views = [View(mode, spec) for _ in range(num_envs)]
+        self._view = View(mode, spec)
         self._max_steps = max_episode_steps
         self._reveals = session.settings.reveals
         self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
@@ -105,8 +105,6 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
-        #: Whether learners receive copies of the frames, so that `seen` keeps the originals.
-        self.keeps_frames = False
 
     def reset(
         self,
@@ -198,7 +196,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         robots = [(at[0], at[1]) for at in cells.tolist()]
         paths = [path for path in map(self._path, range(self.num_envs)[rows]) if path is not None]
         truth = self._truths[row] if self._truths is not None and self._reveals else None
-        return self._views[row].draw(frame, robots, paths, truth)
+        return self._view.draw(frame, robots, paths, truth)
 
     def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
         """Returns the combined frame and the cells of some robots of one world, as new arrays."""
@@ -226,8 +224,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()
-        for view in self._views:
-            view.close()
+        self._view.close()
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[Any]:
         """Returns checked actions. If all robots fly, the session checks their paths."""
@@ -416,9 +413,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._observations.all(self._shown(), self._robots())
 
     def _shown(self) -> NDArray[np.uint8]:
-        """Returns frames for the learner, copied if pictures or `seen` need the originals."""
-        is_own = self.render_mode is None and not self.keeps_frames
-        return self._frames if is_own else self._frames.copy()
+        """Returns frames for the learner, copied if pictures need the originals."""
+        return self._frames if self.render_mode is None else self._frames.copy()
 
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         """Returns the seed of each world, after checking all before a generator is replaced."""
