@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from failures import fails, refuses
 from processes import find, server
 
 import emberwatch
-from emberwatch import belief, errors
+from emberwatch import belief
 
 GOLDEN = np.load(golden_options.FILE)
 

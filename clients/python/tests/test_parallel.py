@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from environments import (
-    LIVELY,
     OBJECTIVE,
     SMALL,
     assert_same,

@@ -16,7 +16,6 @@ from environments import (
     assert_same,
     make,
     make_vec,
-    no_warnings,
     serving,
 )
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv

@@ -11,7 +11,7 @@ import emberwatch._native as _native
 from emberwatch.client.wire import RobotResult, StepAnswer, StepResult, WorldResult
 from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
