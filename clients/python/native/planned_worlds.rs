@@ -1,9 +1,12 @@
 //! Single-robot worlds with their beliefs and the plans of all options.
+//!
+//! Arrays have one row per world; `chosen` marks the rows that a call is about. `results` are bytes of
+//! `wire.RESULT_DTYPE`, `frames` have the shape `[n_worlds, H, W]`.
 
 use crate::answer::RESULT_BYTES;
 use crate::origin::is_short;
 use crate::threads::{Pool, Threads};
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 use emberwatch_acting::options::{OptionAgent, OptionSetup, Shown};
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::OPTIONS;
@@ -22,23 +25,8 @@ pub struct PlannedWorlds {
     threads: Pool,
 }
 
-/// The observations of some worlds, one row per world.
-#[derive(Clone, Copy)]
-pub struct Observed<'a> {
-    pub worlds: &'a [usize],
-    /// Bytes of `wire.RESULT_DTYPE`.
-    pub results: &'a [u8],
-    /// The frames, `[n, H, W]`; `None` if the beliefs already include them.
-    pub frames: Option<&'a [u8]>,
-}
-
-/// A world that is updated: its belief and plans, and its row of [`Observed`].
-struct WorldWork<'a> {
-    planned: &'a mut OptionAgent,
-    world: WorldResult,
-    robot: RobotResult,
-    frame: Option<&'a [u8]>,
-}
+/// A world, and the result and the frame of its step.
+type Seen<'a> = (&'a mut OptionAgent, &'a [u8], &'a [u8]);
 
 impl PlannedWorlds {
     pub fn new(setup: OptionSetup, n_worlds: usize) -> Self {
@@ -54,68 +42,90 @@ impl PlannedWorlds {
         self.worlds.get_mut(world)?.as_mut()
     }
 
-    /// Begins episodes with a first belief. `seeds` lists pairs of a world and its seed.
+    /// Begins episodes with a first belief: either in all chosen worlds, or in none.
     ///
     /// # Errors
-    /// If a world's number is out of range, or if a belief cannot be built.
+    /// If the arrays differ in length, or if a belief cannot be built.
     pub fn start_episodes(
         &mut self,
-        seeds: impl Iterator<Item = (usize, u64)>,
+        chosen: &[bool],
+        results: &[u8],
         prior: &Belief,
     ) -> Result<()> {
-        let seeds: Vec<(usize, u64)> = seeds.collect();
-        let worlds: Vec<usize> = seeds.iter().map(|&(world, _)| world).collect();
-        self.rows(&worlds)?;
-        let Self { setup, threads, .. } = self;
-        let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, setup.begun(prior, seed)?));
-        let n_worlds = seeds.len();
-        let begun = threads.work(is_short(setup.estimator(), n_worlds), |threads| {
-            threads.each(seeds, begin)
+        self.check(chosen, results, None)?;
+        let rows = results.chunks_exact(RESULT_BYTES).zip(chosen).enumerate();
+        let seeds = rows.filter_map(|(world, (result, &chosen))| {
+            chosen.then(|| (world, parsed(result).0.seed))
         });
-        // Either all episodes begin, or none.
+        let seeds: Vec<(usize, u64)> = seeds.collect();
+        let Self { setup, threads, .. } = self;
+        let is_short = is_short(setup.estimator(), seeds.len());
+        let begin = |(world, seed)| anyhow::Ok((world, setup.begun(prior, seed)?));
+        let begun = threads.work(is_short, |threads| threads.each(seeds, begin));
         for (world, planned) in begun.into_iter().collect::<Result<Vec<_>>>()? {
             self.worlds[world] = Some(planned);
         }
         Ok(())
     }
 
-    /// Updates beliefs with frames. If `plans` is set, also plans all options. A world whose belief refuses its frame
-    /// stays unchanged.
+    /// Updates the beliefs about the chosen worlds with a step. A world whose belief refuses its frame stays unchanged.
     ///
     /// # Errors
-    /// If the arrays differ in length, a world's number is out of range, or a belief refuses its frame.
-    pub fn update(&mut self, observed: Observed<'_>, plans: bool) -> Result<()> {
-        let n_cells = self.setup.shape().n_cells();
-        observed.check(n_cells)?;
-        let rows = self.rows(observed.worlds)?;
-        let Self {
-            setup,
-            threads,
-            worlds,
-        } = self;
-        let works = worlds.iter_mut().zip(rows);
-        let works = works
-            .filter_map(|(planned, row)| Some(observed.work(planned.as_mut()?, row?, n_cells)));
-        let works: Vec<WorldWork<'_>> = works.collect();
-        let is_short = is_short(setup.estimator(), works.len());
-        threads.work(is_short, |threads| update(setup, works, plans, threads))
+    /// If the arrays differ in length, or a belief refuses its frame.
+    pub fn update(&mut self, chosen: &[bool], results: &[u8], frames: &[u8]) -> Result<()> {
+        self.check(chosen, results, Some(frames))?;
+        let frames = frames.chunks_exact(self.setup.shape().n_cells());
+        let rows = results.chunks_exact(RESULT_BYTES).zip(frames).zip(chosen);
+        let seen = self.worlds.iter_mut().zip(rows);
+        let seen = seen.filter_map(|(planned, ((result, frame), &chosen))| {
+            Some((planned.as_mut().filter(|_| chosen)?, result, frame))
+        });
+        let seen: Vec<Seen<'_>> = seen.collect();
+        let is_short = is_short(self.setup.estimator(), seen.len());
+        let setup = &self.setup;
+        self.threads
+            .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Returns, for each world here, its index in `worlds`; `None` if it is not listed there.
-    fn rows(&self, worlds: &[usize]) -> Result<Vec<Option<usize>>> {
-        let mut rows = vec![None; self.worlds.len()];
-        for (row, &world) in worlds.iter().enumerate() {
-            let (place, n_worlds) = (rows.get_mut(world), self.worlds.len());
-            *place.with_context(|| {
-                format!("options: expected a world below {n_worlds}, got {world}")
-            })? = Some(row);
-        }
-        Ok(rows)
+    /// Updates the belief about one world with an earlier step: its result and its frame, `[1, H, W]`.
+    ///
+    /// # Errors
+    /// As for [`Self::update`].
+    pub fn recall(&mut self, world: usize, result: &[u8], frame: &[u8]) -> Result<()> {
+        ensure!(result.len() == RESULT_BYTES, "options: expected one result");
+        let Some(planned) = self.worlds.get_mut(world).and_then(Option::as_mut) else {
+            return Ok(());
+        };
+        let (setup, seen) = (&self.setup, vec![(planned, result, frame)]);
+        let is_short = is_short(setup.estimator(), 1);
+        self.threads
+            .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Returns features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of the last plans of all
-    /// worlds.
-    pub fn plans(&self) -> (Array3<f32>, Array3<u8>) {
+    /// Plans all options in the chosen worlds. Returns features `[n_worlds, options, features]` and paths
+    /// `[n_worlds, options, T]` of the last plans of all worlds.
+    ///
+    /// # Errors
+    /// If the arrays differ in length.
+    pub fn plan(&mut self, chosen: &[bool], results: &[u8]) -> Result<(Array3<f32>, Array3<u8>)> {
+        self.check(chosen, results, None)?;
+        let rows = results.chunks_exact(RESULT_BYTES).zip(chosen);
+        let planning = self.worlds.iter_mut().zip(rows);
+        let planning = planning.filter_map(|(planned, (result, &chosen))| {
+            Some((
+                planned.as_mut().filter(|_| chosen)?,
+                parsed(result).1.cell(),
+            ))
+        });
+        let planning: Vec<_> = planning.collect();
+        let is_short = is_short(self.setup.estimator(), planning.len());
+        self.threads.work(is_short, |threads| {
+            threads.each(planning, |(planned, robot)| planned.plan(robot))
+        });
+        Ok(self.plans())
+    }
+
+    fn plans(&self) -> (Array3<f32>, Array3<u8>) {
         let dim = (self.worlds.len(), OPTIONS.len());
         let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));
         let mut paths = Array3::zeros((dim.0, dim.1, self.setup.n_moves()));
@@ -132,65 +142,41 @@ impl PlannedWorlds {
         }
         (features, paths)
     }
-}
 
-impl<'a> Observed<'a> {
-    fn check(&self, n_cells: usize) -> Result<()> {
-        let n_worlds = self.worlds.len();
+    fn check(&self, chosen: &[bool], results: &[u8], frames: Option<&[u8]>) -> Result<()> {
+        let (n_worlds, n_cells) = (self.worlds.len(), self.setup.shape().n_cells());
         ensure!(
-            self.results.len() == n_worlds * RESULT_BYTES
-                && self.frames.is_none_or(|it| it.len() == n_worlds * n_cells),
+            chosen.len() == n_worlds
+                && results.len() == n_worlds * RESULT_BYTES
+                && frames.is_none_or(|it| it.len() == n_worlds * n_cells),
             "options: expected a result and a frame for each of {n_worlds} worlds, got other lengths"
         );
         Ok(())
     }
-
-    fn work(&self, planned: &'a mut OptionAgent, row: usize, n_cells: usize) -> WorldWork<'a> {
-        let result = &self.results[row * RESULT_BYTES..][..RESULT_BYTES];
-        let (world, robot) = result.split_at(WORLD_BYTES);
-        WorldWork {
-            planned,
-            world: bytemuck::pod_read_unaligned(world),
-            robot: bytemuck::pod_read_unaligned(robot),
-            frame: self.frames.map(|it| &it[row * n_cells..][..n_cells]),
-        }
-    }
 }
 
-/// Corrects and predicts the beliefs, then plans.
-fn update(
-    setup: &OptionSetup,
-    mut works: Vec<WorldWork<'_>>,
-    plans: bool,
-    threads: Threads,
-) -> Result<()> {
-    let seen = threads.each(&mut works, |work| work.see(setup));
-    let fits = works.into_iter().zip(&seen);
-    let mut works: Vec<_> = fits
-        .filter_map(|(work, seen)| seen.is_ok().then_some(work))
-        .collect();
-    let new = works.iter_mut().filter(|work| work.frame.is_some());
-    let new = new.map(|work| &mut *work.planned);
-    match threads {
-        Threads::Several => OptionAgent::predict_all(new),
-        Threads::One => new.for_each(|planned| OptionAgent::predict_all([planned])),
-    }
-    if plans {
-        threads.each(works, |work| work.planned.plan(work.robot.cell()));
-    }
-    seen.into_iter().collect()
-}
-
-impl WorldWork<'_> {
-    /// Corrects the belief with the frame, if there is one.
-    fn see(&mut self, setup: &OptionSetup) -> Result<()> {
-        let Some(frame) = self.frame else {
-            return Ok(());
-        };
-        let n_observations = setup.model().n_observations();
-        self.planned.see(&Shown {
-            frame: Frame::from_bytes(setup.shape(), n_observations, frame)?,
-            reward: (self.world.step > 0).then_some(self.robot.reward),
+/// Corrects and predicts the beliefs.
+fn update(setup: &OptionSetup, mut seen: Vec<Seen<'_>>, threads: Threads) -> Result<()> {
+    let corrected = threads.each(&mut seen, |(planned, result, frame)| {
+        let (world, robot) = parsed(result);
+        planned.see(&Shown {
+            frame: Frame::from_bytes(setup.shape(), setup.model().n_observations(), frame)?,
+            reward: (world.step > 0).then_some(robot.reward),
         })
+    });
+    let fits = seen.into_iter().zip(&corrected);
+    let fits = fits.filter_map(|((planned, ..), it)| it.is_ok().then_some(planned));
+    match threads {
+        Threads::Several => OptionAgent::predict_all(fits),
+        Threads::One => fits.for_each(|planned| OptionAgent::predict_all([planned])),
     }
+    corrected.into_iter().collect()
+}
+
+fn parsed(result: &[u8]) -> (WorldResult, RobotResult) {
+    let (world, robot) = result.split_at(WORLD_BYTES);
+    (
+        bytemuck::pod_read_unaligned(world),
+        bytemuck::pod_read_unaligned(robot),
+    )
 }

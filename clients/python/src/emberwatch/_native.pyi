@@ -242,8 +242,11 @@ class Options:
     def estimator(self) -> str:
         """Name of the estimator that computes the beliefs."""
 
-    def start_episodes(self, worlds: list[int], seeds: list[int]) -> None:
-        """Starts episodes in `worlds` with these seeds; resets the beliefs about these worlds."""
+    def start_episodes(self, chosen: NDArray[np.bool_], results: NDArray[np.uint8]) -> None:
+        """Starts episodes in the worlds marked in `chosen`, with the first belief.
+
+        `results`, here and below: bytes of `wire.RESULT_DTYPE` for all worlds.
+        """
 
     def take_over(self, world: int, kind: str, data: bytes) -> bool:
         """Loads another client's belief about the current step; False if it does not fit."""
@@ -251,18 +254,18 @@ class Options:
     def left(self, world: int) -> tuple[str, bytes] | None:
         """Returns the kind and the bytes of a belief, for the next client."""
 
-    def see(self, worlds: list[int], results: NDArray[np.uint8], frames: NDArray[np.uint8]) -> None:
-        """Updates beliefs with an earlier step. `results`: as in `plan`; `frames`: `(n, H, W)`."""
+    def recall(self, world: int, result: NDArray[np.uint8], frame: NDArray[np.uint8]) -> None:
+        """Updates the belief about a world with the result and frame of an earlier step."""
+
+    def update(
+        self, chosen: NDArray[np.bool_], results: NDArray[np.uint8], frames: NDArray[np.uint8]
+    ) -> None:
+        """Updates the beliefs about the worlds marked in `chosen` with a step."""
 
     def plan(
-        self,
-        worlds: list[int],
-        results: NDArray[np.uint8],
-        frames: NDArray[np.uint8] | None,
+        self, chosen: NDArray[np.bool_], results: NDArray[np.uint8]
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Updates beliefs with the current step, unless `frames` is None, then plans.
-
-        `results`: bytes of `wire.RESULT_DTYPE`.
+        """Plans all options in the worlds marked in `chosen`.
 
         Returns features `(n_worlds, options, features)` and paths `(n_worlds, options, T)` of all
         worlds, as new arrays.

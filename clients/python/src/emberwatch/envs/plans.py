@@ -69,14 +69,12 @@ class Plans:
         `frames` have a row for every world.
         """
         native = self._native = self._native or self._made()
-        worlds = np.flatnonzero(begun).tolist()
-        native.start_episodes(worlds, results["world"]["seed"][begun].tolist())
-        known = [world for world in worlds if self._resumes(native, world, results[world])]
-        if known:
-            self.features, self._paths = native.plan(known, results[known].view(np.uint8), None)
+        native.start_episodes(begun, results.view(np.uint8))
         new = begun.copy()
-        new[known] = False
-        self._plan(new, results, frames)
+        for world in np.flatnonzero(begun).tolist():
+            new[world] = not self._resumes(native, world, results[world])
+        native.update(new, results.view(np.uint8), frames)
+        self._plan(begun, results)
 
     def paths(self, choices: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Returns the path of each world's chosen option, `(n_worlds, T)`."""
@@ -89,7 +87,9 @@ class Plans:
 
         `results` and `frames` have a row for every world.
         """
-        self._plan(moved, results, frames)
+        assert self._native is not None
+        self._native.update(moved, results.view(np.uint8), frames)
+        self._plan(moved, results)
 
     def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
         """Returns the observations of all worlds, stacked."""
@@ -111,13 +111,13 @@ class Plans:
         """Continues from `memory`, and plans again; `results` has a row for every world."""
         native = self._native
         assert native is not None
-        worlds = list(range(len(memory)))
-        native.start_episodes(worlds, results["world"]["seed"].tolist())
+        every = np.ones(len(memory), np.bool_)
+        native.start_episodes(every, results.view(np.uint8))
         for world, left in enumerate(memory):
             if left is None or not native.take_over(world, *left):
                 expected = f"a state of the estimator {self.estimator!r}"
                 raise invalid("restore_state", expected, "another")
-        self.features, self._paths = native.plan(worlds, results.view(np.uint8), None)
+        self._plan(every, results)
 
     def close(self, results: NDArray[np.void] | None) -> None:
         """Leaves the beliefs about a running server's worlds to their next client."""
@@ -143,14 +143,9 @@ class Plans:
             except EmberwatchError:
                 return  # the server ended or keeps no beliefs: the next client uses past frames
 
-    def _plan(
-        self, worlds: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
-    ) -> None:
+    def _plan(self, worlds: NDArray[np.bool_], results: NDArray[np.void]) -> None:
         assert self._native is not None
-        if worlds.any():
-            chosen = np.flatnonzero(worlds).tolist()
-            told = results[worlds].view(np.uint8), frames[worlds]
-            self.features, self._paths = self._native.plan(chosen, *told)
+        self.features, self._paths = self._native.plan(worlds, results.view(np.uint8))
 
     def _resumes(self, native: _native.Options, world: int, result: np.void) -> bool:
         """Restores the belief of a world; returns whether it includes the current step."""
@@ -161,7 +156,7 @@ class Plans:
         if left is not None and native.take_over(world, left.kind, left.data):
             return True
         for past in self._session.history(world, step):
-            native.see([world], past.results.view(np.uint8), past.frames)
+            native.recall(world, past.results.view(np.uint8), past.frames)
         return False
 
     def _made(self) -> _native.Options:
