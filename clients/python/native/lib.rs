@@ -51,7 +51,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(answer::columns, module)?)?;
     module.add_class::<connection::Connection>()?;
     module.add_class::<flights::Flights>()?;
-    module.add_class::<windows::Windows>()?;
     module.add_class::<lease::Lease>()?;
     module.add_class::<reader::Frames>()?;
     module.add_class::<reader::Truths>()?;

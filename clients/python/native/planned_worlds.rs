@@ -54,9 +54,8 @@ impl PlannedWorlds {
     ) -> Result<()> {
         self.check(chosen, results, None)?;
         let rows = results.chunks_exact(RESULT_BYTES).zip(chosen).enumerate();
-        let seeds = rows.filter_map(|(world, (result, &chosen))| {
-            chosen.then(|| (world, parsed(result).0.seed))
-        });
+        let rows = rows.filter(|(_, (_, chosen))| **chosen);
+        let seeds = rows.map(|(world, (result, _))| (world, parsed(result).0.seed));
         let seeds: Vec<(usize, u64)> = seeds.collect();
         let Self { setup, threads, .. } = self;
         let is_short = is_short(setup.estimator(), seeds.len());

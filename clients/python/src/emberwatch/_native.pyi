@@ -289,7 +289,10 @@ class Flights:
         n_moves: int,
         reward: list[float] | None,
         airspace: _Airspace | None = None,
-    ) -> None: ...
+        windows: list[tuple[int, int]] = ...,
+    ) -> None:
+        """`windows`: side, and number of channels about the world, of each square to show."""
+
     @property
     def robots(self) -> NDArray[np.int64]:
         """Row and column of each robot. All properties are new arrays."""
@@ -330,6 +333,17 @@ class Flights:
     def made(self, row: int) -> NDArray[np.uint8]:
         """Returns the moves made by one robot."""
 
+    def show(self, windows: int, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None:
+        """Begins paths in the rows `begun`, with channels `(n_begun, H, W, n_of_world)`."""
+
+    def around(self, windows: int) -> NDArray[np.uint8]:
+        """Returns the cells around the robots as a new array, `(n_rows, side, side, channels)`.
+
+        The channels about the world come first, 0 in visited cells. Three channels follow: 255 in
+        the cells that this path has visited; 255 off the grid and in no-fly cells; 255 times the
+        share of remaining moves.
+        """
+
     def move(self, moved: NDArray[np.bool_], actions: NDArray[np.uint8]) -> NDArray[np.float64]:
         """Makes a move in the rows `moved`; returns the reward of each row."""
 
@@ -367,34 +381,6 @@ class Lease:
     @property
     def steps(self) -> list[int]:
         """The step of each world."""
-
-@final
-class Windows:
-    """A square of cells around each robot, one row per robot: the parts `local` and `recent`.
-
-    The channels about the world come first. Three channels follow: 255 in the cells that this path
-    has visited; 255 off the grid and in no-fly cells; 255 times the share of remaining moves.
-    """
-
-    def __new__(
-        cls,
-        n_rows: int,
-        height: int,
-        width: int,
-        side: int,
-        n_of_world: int,
-        airspace: _Airspace,
-    ) -> Windows:
-        """`side`: side in cells, odd; `n_of_world`: number of channels about the world."""
-
-    def start_paths(self, begun: NDArray[np.bool_], shown: NDArray[np.uint8]) -> None:
-        """Begins paths in the rows `begun`, with channels `(n_begun, H, W, n_of_world)`."""
-
-    def visit(self, flights: Flights, moved: NDArray[np.bool_]) -> None:
-        """Marks the visited cells, and clears the world channels of cells that have paid."""
-
-    def around(self, flights: Flights) -> NDArray[np.uint8]:
-        """Returns the windows of all robots, `(n_rows, side, side, channels)`; a new array."""
 
 class Frames:
     """A reader of `Frame`s, of one world or of all worlds."""

@@ -11,7 +11,6 @@ from emberwatch.client import wire
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_choice, as_choices
 from emberwatch.envs.base import ONE_ROW, Reward, WorldEnv, check_reward
-from emberwatch.envs.flights import flights_of
 from emberwatch.envs.observations import WINDOW, MovesParts, Observations
 from emberwatch.envs.session import Session, not_reset
 from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
@@ -125,10 +124,11 @@ class WildfireMovesEnv(WorldEnv):
         """See the class."""
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
         session = Session(settings)
-        self._flights = flights = flights_of(session.spec, 1, pays=reward == "move")
-        self._parts = parts = Observations(observation, session, flights, window, kind)
         pays = check_reward(reward, "move")
+        parts = Observations(observation, session, kind, window=window, pays=reward == "move")
         super().__init__(session, parts, spaces.Discrete(wire.N_MOVES), pays=pays)
+        assert parts.flights is not None
+        self._flights = parts.flights
 
     def step(self, action: np.integer[Any] | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one move. Move number T completes the path and moves the world.
@@ -156,7 +156,6 @@ class WildfireMovesEnv(WorldEnv):
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Makes a move that does not complete its path."""
         reward = float(self._flights.move(ONE_ROW, move)[0])
-        self._parts.visit(ONE_ROW)
         observation, info = self._seen()
         return observation, reward, False, False, info
 
@@ -222,12 +221,12 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesVectorEnv, world, needs_truth=reward == "move")
         session = vector_session(settings, num_envs)
-        n_rows = session.n_rows
-        self._flights = flights = flights_of(session.spec, n_rows, pays=reward == "move")
-        self._parts = Observations(observation, session, flights, window, kind)
+        parts = Observations(observation, session, kind, window=window, pays=reward == "move")
+        assert parts.flights is not None
+        self._flights = parts.flights
         super().__init__(
             session,
-            self._parts,
+            parts,
             spaces.Discrete(wire.N_MOVES),
             pays=pays,
             max_episode_steps=max_episode_steps,
@@ -248,19 +247,13 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
     ) -> NDArray[np.float64]:
         completed = flown & self._flights.completes()
         if not completed.any():
-            return self._move(actions, flown)
+            return self._flights.move(flown, actions)
         self._exchange(self._flights.paths(actions), completed)
         rewards = self._columns.rewards - self._flights.paid
         others = flown & ~completed
         if others.any():
-            rewards = np.where(others, self._move(actions, others), rewards)
+            rewards = np.where(others, self._flights.move(others, actions), rewards)
         self._begin(completed)
-        return rewards
-
-    def _move(self, actions: NDArray[np.uint8], moved: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Makes a move of the robots `moved`, which completes no path."""
-        rewards = self._flights.move(moved, actions)
-        self._parts.visit(moved)
         return rewards
 
     def _reported(self) -> dict[str, NDArray[Any]]:

@@ -8,15 +8,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from emberwatch._native import Flights, Windows
+from emberwatch._native import Flights
 from emberwatch.belief import Belief, kinds, known
 from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
 from emberwatch.common.arguments import as_integer
+from emberwatch.envs.flights import flights_of
 from emberwatch.envs.last_seen import LastSeen
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
-from emberwatch.envs.window import N_OF_BELIEF, N_OF_PATH, of_belief
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 
 Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
@@ -32,6 +32,13 @@ WINDOW: Final = 15
 #: Maximum side of the parts `local` and `recent`, in cells.
 MAX_WINDOW: Final = 255
 
+#: Number of channels of `local` that come from the belief.
+N_OF_BELIEF: Final = 2
+
+#: Number of the last channels of `local` and `recent`: visited cells, cells off the grid or no-fly,
+#: share of the moves that remain.
+N_OF_PATH: Final = 3
+
 #: Parts that need a filter, parts that need a memory of frames, and parts about other robots.
 OF_BELIEF: Final = frozenset(("belief", "local"))
 _OF_MEMORY: Final = frozenset(("age", "recent"))
@@ -45,22 +52,24 @@ class Observations:
         self,
         parts: str | Sequence[str],
         session: Session,
-        flights: Flights | None = None,
-        window: int = WINDOW,
         kind: str = "known",
+        *,
+        window: int | None = None,
+        pays: bool = False,
     ) -> None:
         """Checks the parts and makes their spaces.
 
-        With `flights`, the parts about an incomplete path are available.
+        With `window`, robots fly move by move, and the parts about an incomplete path are
+        available. `pays`: whether moves are rewarded.
         """
         spec, n_rows = session.spec, session.n_rows
-        known = _spaces(spec, None if flights is None else window)
+        known = _spaces(spec, window)
         names = names_of(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
             raise invalid("observation", f"one or several of {', '.join(known)}", repr_of(parts))
         self._names, self._is_plain = names, isinstance(parts, str)
         self._session, self._spec = session, spec
-        self._n_rows, self._flights = n_rows, flights
+        self._n_rows = n_rows
         #: The index of the first row's robot in its world.
         self._first = session.settings.robot or 0
         #: Whether a part is about other robots.
@@ -84,11 +93,13 @@ class Observations:
         self._last_seen = LastSeen(n_rows, *grid) if _OF_MEMORY & set(names) else None
         self._belief: Belief | None = None
         channels = {"local": N_OF_BELIEF, "recent": spec.n_observations}
-        self._windows = {
-            name: Windows(n_rows, spec.height, spec.width, window, channels[name], spec.airspace)
-            for name in names
-            if name in channels
-        }
+        #: The parts that `flights` shows around the robots, in its order.
+        self._windows = [name for name in names if name in channels]
+        #: The paths of robots that fly move by move.
+        self.flights: Flights | None = None
+        if window is not None:
+            windows = [(window, channels[name]) for name in self._windows]
+            self.flights = flights_of(spec, n_rows, windows, pays=pays)
         #: Whether observations depend on frames before the last one.
         self.has_memory = has_memory(names)
         self._image = np.empty(0, np.uint8)
@@ -162,7 +173,7 @@ class Observations:
 
     def memory(self) -> dict[str, Any]:
         """Returns what the observations depend on, apart from the last frames."""
-        flights = self._flights
+        flights = self.flights
         return {
             "belief": self._belief,
             "last_seen": self._last_seen,
@@ -178,15 +189,8 @@ class Observations:
         for index in range(max(map(len, made), default=0)):
             moved = np.array([len(moves) > index for moves in made])
             actions = [int(moves[index]) if len(moves) > index else 0 for moves in made]
-            if self._flights is not None:
-                self._flights.move(moved, np.array(actions, np.uint8))
-                self.visit(moved)
-
-    def visit(self, moved: NDArray[np.bool_]) -> None:
-        """Updates the rows `moved` with a move that did not complete its path."""
-        if self._flights is not None:
-            for windows in self._windows.values():
-                windows.visit(self._flights, moved)
+            if self.flights is not None:
+                self.flights.move(moved, np.array(actions, np.uint8))
 
     def all(
         self,
@@ -244,14 +248,14 @@ class Observations:
             return self._last_seen.ages[..., np.newaxis].copy()
         if name == "belief":
             return self._image.copy()
-        assert self._flights is not None
+        assert self.flights is not None
         if name in self._windows:
-            return self._windows[name].around(self._flights)
+            return self.flights.around(self._windows.index(name))
         if name == "visited":
-            return self._flights.visited[..., np.newaxis]
+            return self.flights.visited[..., np.newaxis]
         if name == "action_mask":
-            return self._flights.masks
-        return self._flights.n_made
+            return self.flights.masks
+        return self.flights.n_made
 
     def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Returns 255 in the cells of each row's teammates; `robots` includes all robots."""
@@ -276,11 +280,24 @@ class Observations:
         if self._belief is not None and "belief" in self._names:
             image = np.rint(255.0 * self._belief.belief.transpose(1, 2, 3, 0))
             self._image = image.astype(np.uint8)
-        for name, windows in self._windows.items():
+        for index, name in enumerate(self._windows):
+            assert self.flights is not None
             if name == "recent" and self._last_seen is not None:
-                windows.start_paths(rows, self._last_seen.fading(rows))
+                self.flights.show(index, rows, self._last_seen.fading(rows))
             elif self._belief is not None:
-                windows.start_paths(rows, of_belief(self._belief, rows))
+                self.flights.show(index, rows, _local(self._belief, rows))
+
+
+def _local(belief: Belief, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Returns the first channels of `local` for the rows `rows`, shape (n, H, W, 2).
+
+    These are 255 times the probability of the state that pays most, and 255 times the entropy
+    divided by log S.
+    """
+    target = belief.belief[belief.target_state]
+    entropy = belief.entropy() / np.log(len(belief.state_names))
+    channels = np.stack((target[rows], entropy[rows]), axis=-1)
+    return np.rint(255.0 * channels).astype(np.uint8)
 
 
 def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:
