@@ -1,7 +1,6 @@
 """Models of lively worlds with a sensor, no-fly cells and maps."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +110,3 @@ def legal_moves(cell: tuple[int, int], no_fly: Cells) -> list[bool]:
     """Returns which moves leave a cell; all moves if none does."""
     leaves = [cells_of(cell, [move], no_fly)[1] != cell for move in range(4)]
     return leaves if any(leaves) else [True] * 4
-
-
-def stays(cells: Sequence[tuple[int, int]]) -> int:
-    return sum(before == after for before, after in pairwise(cells))

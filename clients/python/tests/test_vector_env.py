@@ -199,19 +199,6 @@ def test_returned_arrays_are_writable_and_never_change(
     assert_same([value for value in returned if len(value) == 5], kept)
 
 
-def test_the_registrys_time_limit_is_the_default() -> None:
-    def n_steps_of(**keywords: Any) -> int:
-        env = make_vec(1, **keywords)
-        env.reset(seed=1)
-        still = np.zeros((1, 4), int)
-        taken = next((n for n in range(1, 1101) if env.step(still)[3][0]), 0)
-        env.close()
-        return taken
-
-    assert [n_steps_of(), n_steps_of(max_episode_steps=7)] == [1000, 7]
-    assert [n_steps_of(max_episode_steps=endless) for endless in (None, -1)] == [0, 0]
-
-
 @pytest.mark.parametrize("name", [WILDFIRE, OBJECTIVE])
 def test_pictures_equal_those_of_single_environments(name: str) -> None:
     keywords = {**ALL[name], "render_mode": "rgb_array", "truth": True, "max_episode_steps": 3}
