@@ -11,9 +11,7 @@ use crate::rollout::building;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Proposal;
-use emberwatch_messages::agent_belief::Intent;
 use emberwatch_model::{Cell, Frame, Model, Shape};
-use std::time::{Duration, Instant};
 
 /// The data that all worlds share: the model, the kind of belief with its learned values, and the planner's settings.
 pub struct OptionSetup {
@@ -30,8 +28,6 @@ pub struct OptionAgent {
     agent: Agent,
     /// In the order of [`emberwatch_belief::planning::OPTIONS`].
     proposals: Vec<Proposal>,
-    /// The time that the last planning took.
-    planning: Duration,
 }
 
 /// The observation of a world after a step or a reset.
@@ -110,7 +106,6 @@ impl OptionSetup {
         Ok(OptionAgent {
             agent: building::agent(policy, config, &conditions, self.n_moves, seed)?,
             proposals: Vec::new(),
-            planning: Duration::ZERO,
         })
     }
 }
@@ -144,24 +139,12 @@ impl OptionAgent {
 
     /// Plans all options from the robot's cell.
     pub fn plan(&mut self, robot: Cell) {
-        let start = Instant::now();
         self.proposals = self.agent.propose(robot);
-        self.planning = start.elapsed();
     }
 
     /// Returns the features and paths of the last plans, in the order of `OPTIONS`. Empty before the first plan.
     pub fn proposals(&self) -> &[Proposal] {
         &self.proposals
-    }
-
-    /// Records the flown option. Returns the policy, estimator and objective behind the path, as they are published to
-    /// observers.
-    pub fn intent(&mut self, flown: Option<usize>) -> Intent {
-        if let Some(proposal) = flown.and_then(|index| self.proposals.get(index)) {
-            self.agent
-                .take_up(flown.unwrap_or_default(), proposal.clone());
-        }
-        self.agent.intent(self.planning)
     }
 
     pub fn agent(&self) -> &Agent {

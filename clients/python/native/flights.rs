@@ -4,12 +4,13 @@ use crate::airspace::Given;
 use crate::errors::check_memory;
 use crate::model::shape_of;
 use crate::refusal::invalid;
+use crate::windows::{N_OF_PATH, Windows};
 use emberwatch_model::path::{MAX_MOVES, Move};
 use emberwatch_model::{Airspace, Cell, Shape};
 use numpy::ndarray::{ArrayView1, ArrayView3, Axis};
 use numpy::{
-    PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
-    PyReadonlyArray3,
+    PyArray1, PyArray2, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
+    PyReadonlyArray3, PyReadonlyArray4,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -22,6 +23,7 @@ type Arguments = (
     usize,
     Option<Vec<f64>>,
     Option<Py<PyAny>>,
+    Vec<(usize, usize)>,
 );
 
 /// The current path of each robot, up to its latest move.
@@ -43,12 +45,16 @@ pub struct Flights {
     states: Vec<u8>,
     moves: Vec<u8>,
     paid: Vec<f64>,
+    windows: Vec<Windows>,
 }
 
 #[pymethods]
 impl Flights {
+    /// `windows` lists the squares of cells to show around each robot: their sides, and their numbers of channels about
+    /// the world.
     #[new]
-    #[pyo3(signature = (n_rows, height, width, n_moves, reward, airspace=None))]
+    #[pyo3(signature = (n_rows, height, width, n_moves, reward, airspace=None, windows=vec![]))]
+    #[expect(clippy::too_many_arguments, reason = "the parts of a path")]
     fn new(
         py: Python<'_>,
         n_rows: usize,
@@ -57,6 +63,7 @@ impl Flights {
         n_moves: usize,
         reward: Option<Vec<f64>>,
         airspace: Option<Py<PyAny>>,
+        windows: Vec<(usize, usize)>,
     ) -> PyResult<Self> {
         let shape = shape_of(py, height, width)?;
         let within = match &airspace {
@@ -67,11 +74,13 @@ impl Flights {
             let expected = format!("an integer within 1 to {MAX_MOVES}");
             return Err(invalid(py, "n_moves", expected, n_moves));
         }
+        let of_windows = windows.iter();
+        let of_windows = of_windows.map(|&(side, n)| Windows::n_bytes(n_rows, shape, side, n));
         let n_bytes = n_rows.saturating_mul(2 * shape.n_cells() + n_moves);
+        let n_bytes = of_windows.fold(n_bytes, usize::saturating_add);
         check_memory(py, format_args!("the flights of {n_rows} robots"), n_bytes)?;
         Ok(Self {
             shape,
-            airspace: within,
             given: airspace,
             n_moves,
             reward,
@@ -81,6 +90,11 @@ impl Flights {
             states: vec![0; n_rows * shape.n_cells()],
             moves: vec![0; n_rows * n_moves],
             paid: vec![0.0; n_rows],
+            windows: windows
+                .iter()
+                .map(|&(side, n_of_world)| Windows::new(n_rows, &within, side, n_of_world))
+                .collect(),
+            airspace: within,
         })
     }
 
@@ -90,7 +104,9 @@ impl Flights {
         let (height, width) = this.shape.dim();
         let reward = this.reward.clone();
         let given = this.given.as_ref().map(|it| it.clone_ref(slf.py()));
-        let arguments = (this.cells.len(), height, width, this.n_moves, reward, given);
+        let windows = this.windows.iter().map(Windows::dim).collect();
+        let n_rows = this.cells.len();
+        let arguments = (n_rows, height, width, this.n_moves, reward, given, windows);
         (slf.get_type(), arguments)
     }
 
@@ -201,6 +217,41 @@ impl Flights {
         Ok(PyArray1::from_slice(py, made))
     }
 
+    /// Sets the channels about the world in the windows of the rows marked in `begun`, whose paths begin, to `shown`,
+    /// `[n_begun, H, W, n_of_world]`.
+    fn show(
+        &mut self,
+        windows: usize,
+        begun: PyReadonlyArray1<'_, bool>,
+        shown: PyReadonlyArray4<'_, u8>,
+    ) -> PyResult<()> {
+        let (begun, shown) = (begun.as_array(), shown.as_array());
+        let (height, width) = self.shape.dim();
+        let windows = &mut self.windows[windows];
+        let n_begun = begun.iter().filter(|it| **it).count();
+        let dim = (n_begun, height, width, windows.dim().1);
+        if begun.len() != self.cells.len() || shown.dim() != dim {
+            let words = "show: expected one flag per row, and a world for each row that begins";
+            return Err(PyValueError::new_err(words));
+        }
+        let rows = (0..begun.len()).filter(|&row| begun[row]);
+        rows.zip(shown.outer_iter())
+            .for_each(|(row, shown)| windows.show(row, shown));
+        Ok(())
+    }
+
+    /// Returns windows, `[n_rows, side, side, channels]`, as a new array.
+    fn around<'py>(&self, py: Python<'py>, windows: usize) -> PyResult<Bound<'py, PyArray4<u8>>> {
+        let (n_rows, windows) = (self.cells.len(), &self.windows[windows]);
+        let (side, n_of_world) = windows.dim();
+        let dim = [n_rows, side, side, n_of_world + N_OF_PATH];
+        let mut out = Vec::with_capacity(dim.iter().product());
+        for (row, &robot) in self.cells.iter().enumerate() {
+            windows.append(row, robot, self.share_left(row), &mut out);
+        }
+        PyArray1::from_vec(py, out).reshape(dim)
+    }
+
     /// Makes one move in each row marked in `moved`. Each action is a move, 0 to 3. Returns the reward of each row.
     fn r#move<'py>(
         &mut self,
@@ -232,13 +283,8 @@ impl Flights {
 }
 
 impl Flights {
-    /// Returns the cell of each robot.
-    pub fn cells(&self) -> &[Cell] {
-        &self.cells
-    }
-
     /// Returns the share of a path's moves that remain, times 255.
-    pub fn share_left(&self, row: usize) -> u8 {
+    fn share_left(&self, row: usize) -> u8 {
         let made = self.n_made[row] as f64 / self.n_moves as f64;
         (255.0 * (1.0 - made)).round_ties_even() as u8
     }
@@ -263,6 +309,9 @@ impl Flights {
         let step = Move::from_low_bits(action.into());
         let cell = self.airspace.after(step, self.cells[row]);
         self.cells[row] = cell;
+        for windows in &mut self.windows {
+            windows.visit(row, cell);
+        }
         let at = row * self.shape.n_cells() + self.shape.index(cell);
         let is_new = std::mem::replace(&mut self.visited[at], 255) == 0;
         let reward = self.reward.as_ref().filter(|_| is_new);

@@ -48,13 +48,11 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     #[cfg(unix)]
     fork::register(module)?;
     module.add_function(wrap_pyfunction!(moves::choices, module)?)?;
-    module.add_function(wrap_pyfunction!(moves::moves, module)?)?;
     module.add_class::<answer::StepAnswer>()?;
     module.add_function(wrap_pyfunction!(answer::columns, module)?)?;
     module.add_class::<client::Client>()?;
     module.add_function(wrap_pyfunction!(client::connect, module)?)?;
     module.add_class::<flights::Flights>()?;
-    module.add_class::<windows::Windows>()?;
     module.add_class::<lease::Lease>()?;
     module.add_class::<reader::Observer>()?;
     module.add_class::<reader::OutlookReader>()?;
@@ -71,7 +69,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<settings::CheckedSettings>()?;
     module.add_function(wrap_pyfunction!(settings::model_text, module)?)?;
     module.add_function(wrap_pyfunction!(settings::read_again, module)?)?;
-    module.add_function(wrap_pyfunction!(settings::world_settings, module)?)?;
     module.add_function(wrap_pyfunction!(prior::simulated_prior, module)?)?;
     module.add("RECOMMENDED", RECOMMENDED.name)?;
     module.add("VERSION", env!("CARGO_PKG_VERSION"))?;

@@ -1,10 +1,7 @@
 //! Conversion of a caller's moves, which are arrays of integers, to bytes.
 
 use emberwatch_model::path::check_moves;
-use numpy::{
-    Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArray,
-    PyUntypedArrayMethods,
-};
+use numpy::{Element, PyArray1, PyReadonlyArrayDyn, PyUntypedArray, PyUntypedArrayMethods};
 use pyo3::PyTypeInfo;
 use pyo3::prelude::*;
 
@@ -17,20 +14,6 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> Optio
     });
     let moves = fast.or_else(|| read::<u8>(given, expected, |value| value))?;
     check_moves(&moves).is_ok().then_some(moves)
-}
-
-/// Converts paths as [`paths`] does, but returns an array `[n_robots, n_moves]`.
-#[pyfunction]
-pub fn moves<'py>(
-    given: &Bound<'py, PyAny>,
-    n_robots: usize,
-    n_moves: usize,
-) -> PyResult<Option<Bound<'py, PyArray2<u8>>>> {
-    let moves = paths(given, n_robots, n_moves).map(|moves| {
-        let moves = PyArray1::from_vec(given.py(), moves);
-        moves.reshape([n_robots, n_moves])
-    });
-    moves.transpose()
 }
 
 /// Converts an array of choices, one per row, to bytes. Returns `None` unless it is a plain `int64` array of values from

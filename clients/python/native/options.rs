@@ -1,13 +1,12 @@
 //! Options for Python: beliefs about worlds of one robot each, and the plans that a learner chooses from.
 
 use crate::airspace::Given;
-use crate::client::checked;
 use crate::errors::warn;
 use crate::estimators::raise;
 use crate::model::{model_of, shape_of};
 use crate::origin::decoded;
 use crate::owned::Owned;
-use crate::planned_worlds::{Observed, PlannedWorlds, Watched};
+use crate::planned_worlds::PlannedWorlds;
 use crate::prior::first_belief;
 use crate::refusal::{invalid, refused};
 use emberwatch_acting::beliefs::{self, BeliefKind};
@@ -70,8 +69,7 @@ pub struct Options {
 #[pymethods]
 impl Options {
     /// Checks all arguments. Beliefs exist only after [`Self::begin`]. `checkpoint` is a path, for errors, and the bytes
-    /// of its file. `watched` is the instance in which beliefs are published, and the number that the first of these
-    /// worlds has in that instance.
+    /// of its file.
     #[new]
     fn new(
         py: Python<'_>,
@@ -80,7 +78,6 @@ impl Options {
         estimator: Option<&str>,
         checkpoint: Option<(String, PyBackedBytes)>,
         prior: &str,
-        watched: Option<(String, u32)>,
     ) -> PyResult<Self> {
         let estimator = estimator.map(beliefs::of_options).transpose();
         let estimator =
@@ -111,27 +108,22 @@ impl Options {
         } else {
             Prior::Initial
         };
-        let watched = watched.map(|(instance, first_world)| {
-            Ok::<_, PyErr>(Watched {
-                instance: checked(py, &instance)?,
-                first_world,
-                feed: None,
-            })
-        });
         Ok(Self {
             estimator: setup.estimator().name.into(),
             first: (first, setup.model().clone()),
             prior: OnceLock::new(),
-            worlds: Owned::new(
-                "options",
-                PlannedWorlds::new(setup, n_worlds, watched.transpose()?),
-            ),
+            worlds: Owned::new("options", PlannedWorlds::new(setup, n_worlds)),
         })
     }
 
-    /// Starts an episode in each of `worlds`, with the first belief and a seed. The first call may have to simulate the
-    /// first belief, which takes seconds.
-    fn start_episodes(&self, py: Python<'_>, worlds: Vec<usize>, seeds: Vec<u64>) -> PyResult<()> {
+    /// Starts episodes with the first belief in the worlds marked in `chosen`. `results`, here and below, are the bytes of
+    /// `wire.RESULT_DTYPE` for all worlds. The first call may have to simulate the first belief, which takes seconds.
+    fn start_episodes(
+        &self,
+        py: Python<'_>,
+        chosen: PyReadonlyArray1<'_, bool>,
+        results: PyReadonlyArray1<'_, u8>,
+    ) -> PyResult<()> {
         let prior = match self.prior.get() {
             Some(prior) => prior,
             None => {
@@ -141,10 +133,10 @@ impl Options {
                 self.prior.get_or_init(|| prior)
             }
         };
-        let seeds = worlds.into_iter().zip(seeds);
+        let (chosen, results) = (chosen.as_slice()?, results.as_slice()?);
         let begun = self
             .worlds
-            .with(py, |worlds| worlds.start_episodes(seeds, prior));
+            .with(py, |worlds| worlds.start_episodes(chosen, results, prior));
         begun?.map_err(|error| raise(py, &error))
     }
 
@@ -165,48 +157,46 @@ impl Options {
         })
     }
 
-    /// Updates beliefs with an earlier step of `worlds`: its results, as bytes of `wire.RESULT_DTYPE`, and its frames,
-    /// `[n, H, W]`.
-    fn see(
+    /// Updates the belief about a world with an earlier step: its result, and its frame, `[1, H, W]`.
+    fn recall(
         &self,
         py: Python<'_>,
-        worlds: Vec<usize>,
+        world: usize,
+        result: PyReadonlyArray1<'_, u8>,
+        frame: PyReadonlyArray3<'_, u8>,
+    ) -> PyResult<()> {
+        let (result, frame) = (result.as_slice()?, frame.as_slice()?);
+        let recalled = self.worlds.with(py, |it| it.recall(world, result, frame));
+        recalled?.map_err(|error| raise(py, &error))
+    }
+
+    /// Updates the beliefs about the worlds marked in `chosen` with a step. `frames`, `[n, H, W]`, has all worlds.
+    fn update(
+        &self,
+        py: Python<'_>,
+        chosen: PyReadonlyArray1<'_, bool>,
         results: PyReadonlyArray1<'_, u8>,
         frames: PyReadonlyArray3<'_, u8>,
     ) -> PyResult<()> {
-        let observed = Observed {
-            worlds: &worlds,
-            results: results.as_slice()?,
-            frames: Some(frames.as_slice()?),
-            flown: None,
-        };
-        let seen = self.worlds.with(py, |it| it.update(observed, false));
+        let (chosen, results) = (chosen.as_slice()?, results.as_slice()?);
+        let frames = frames.as_slice()?;
+        let seen = self
+            .worlds
+            .with(py, |it| it.update(chosen, results, frames));
         seen?.map_err(|error| raise(py, &error))
     }
 
-    /// Updates beliefs with the current step of `worlds`, then plans all options. If `frames` is `None`, the beliefs
-    /// already include this step. `flown` lists the options that the robots have just flown. Returns features
-    /// `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of all worlds.
+    /// Plans all options in the worlds marked in `chosen`. Returns features `[n_worlds, options, features]` and paths
+    /// `[n_worlds, options, T]` of all worlds.
     fn plan<'py>(
         &self,
         py: Python<'py>,
-        worlds: Vec<usize>,
-        results: PyReadonlyArray1<'py, u8>,
-        frames: Option<PyReadonlyArray3<'py, u8>>,
-        flown: Option<Vec<usize>>,
+        chosen: PyReadonlyArray1<'_, bool>,
+        results: PyReadonlyArray1<'_, u8>,
     ) -> PyResult<Plans<'py>> {
-        let frames = frames.as_ref().map(|frames| frames.as_slice());
-        let observed = Observed {
-            worlds: &worlds,
-            results: results.as_slice()?,
-            frames: frames.transpose()?,
-            flown: flown.as_deref(),
-        };
-        let plans = self.worlds.with(py, |it| {
-            it.update(observed, true)?;
-            Ok(it.plans())
-        });
-        let (features, paths) = plans?.map_err(|error| raise(py, &error))?;
+        let (chosen, results) = (chosen.as_slice()?, results.as_slice()?);
+        let plans = self.worlds.with(py, |it| it.plan(chosen, results))?;
+        let (features, paths) = plans.map_err(|error| raise(py, &error))?;
         Ok((features.into_pyarray(py), paths.into_pyarray(py)))
     }
 

@@ -1,16 +1,16 @@
-//! Single-robot worlds with their beliefs and plans: belief updates, planning, and publishing to observers.
+//! Single-robot worlds with their beliefs and the plans of all options.
+//!
+//! Arrays have one row per world; `chosen` marks the rows that a call is about. `results` are bytes of
+//! `wire.RESULT_DTYPE`, `frames` have the shape `[n_worlds, H, W]`.
 
 use crate::answer::RESULT_BYTES;
 use crate::origin::is_short;
 use crate::threads::{Pool, Threads};
-use crate::wire::{Feed, View};
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 use emberwatch_acting::options::{OptionAgent, OptionSetup, Shown};
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
-use emberwatch_messages::agent_belief::Intent;
-use emberwatch_messages::instance::Instance;
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::payload::WORLD_BYTES;
 use emberwatch_model::Frame;
@@ -23,62 +23,17 @@ pub struct PlannedWorlds {
     /// `None` before a world's first episode.
     worlds: Vec<Option<OptionAgent>>,
     threads: Pool,
-    watched: Option<Watched>,
 }
 
-/// The channel on which beliefs are published to observers.
-pub struct Watched {
-    pub instance: Instance,
-    /// The instance's number of the first of these worlds.
-    pub first_world: u32,
-    /// `None` until the first frame, which opens the channel.
-    pub feed: Option<Feed>,
-}
-
-/// The observations of some worlds, one row per world.
-#[derive(Clone, Copy)]
-pub struct Observed<'a> {
-    pub worlds: &'a [usize],
-    /// Bytes of `wire.RESULT_DTYPE`.
-    pub results: &'a [u8],
-    /// The frames, `[n, H, W]`; `None` if the beliefs already include them.
-    pub frames: Option<&'a [u8]>,
-    /// The option that each robot has just flown.
-    pub flown: Option<&'a [usize]>,
-}
-
-/// A row of [`Observed`].
-struct Row<'a> {
-    world: WorldResult,
-    robot: RobotResult,
-    frame: Option<&'a [u8]>,
-    flown: Option<usize>,
-}
-
-/// The work on one world: its observation, and whether to plan and to publish.
-struct WorldWork<'a> {
-    index: usize,
-    planned: &'a mut OptionAgent,
-    observed: Row<'a>,
-    plans: bool,
-    is_shown: bool,
-}
-
-/// The data to publish about a world: its belief after the frame, and the plan.
-struct Outlook {
-    index: usize,
-    world: WorldResult,
-    belief: Belief,
-    intent: Intent,
-}
+/// A world, and the result and the frame of its step.
+type Seen<'a> = (&'a mut OptionAgent, &'a [u8], &'a [u8]);
 
 impl PlannedWorlds {
-    pub fn new(setup: OptionSetup, n_worlds: usize, watched: Option<Watched>) -> Self {
+    pub fn new(setup: OptionSetup, n_worlds: usize) -> Self {
         Self {
             setup,
             worlds: (0..n_worlds).map(|_| None).collect(),
             threads: Pool::default(),
-            watched,
         }
     }
 
@@ -87,82 +42,89 @@ impl PlannedWorlds {
         self.worlds.get_mut(world)?.as_mut()
     }
 
-    /// Begins episodes with a first belief. `seeds` lists pairs of a world and its seed.
+    /// Begins episodes with a first belief: either in all chosen worlds, or in none.
     ///
     /// # Errors
-    /// If a world's number is out of range, or if a belief cannot be built.
+    /// If the arrays differ in length, or if a belief cannot be built.
     pub fn start_episodes(
         &mut self,
-        seeds: impl Iterator<Item = (usize, u64)>,
+        chosen: &[bool],
+        results: &[u8],
         prior: &Belief,
     ) -> Result<()> {
+        self.check(chosen, results, None)?;
+        let rows = results.chunks_exact(RESULT_BYTES).zip(chosen).enumerate();
+        let rows = rows.filter(|(_, (_, chosen))| **chosen);
+        let seeds = rows.map(|(world, (result, _))| (world, parsed(result).0.seed));
         let seeds: Vec<(usize, u64)> = seeds.collect();
-        let worlds: Vec<usize> = seeds.iter().map(|&(world, _)| world).collect();
-        self.rows(&worlds)?;
         let Self { setup, threads, .. } = self;
-        let begin = |(world, seed)| Ok::<_, anyhow::Error>((world, setup.begun(prior, seed)?));
-        let n_worlds = seeds.len();
-        let begun = threads.work(is_short(setup.estimator(), n_worlds), |threads| {
-            threads.each(seeds, begin)
-        });
-        // Either all episodes begin, or none.
+        let is_short = is_short(setup.estimator(), seeds.len());
+        let begin = |(world, seed)| anyhow::Ok((world, setup.begun(prior, seed)?));
+        let begun = threads.work(is_short, |threads| threads.each(seeds, begin));
         for (world, planned) in begun.into_iter().collect::<Result<Vec<_>>>()? {
             self.worlds[world] = Some(planned);
         }
         Ok(())
     }
 
-    /// Updates beliefs with frames. If `plans` is set, also plans all options.
+    /// Updates the beliefs about the chosen worlds with a step. A world whose belief refuses its frame stays unchanged.
     ///
     /// # Errors
-    /// If the arrays differ in length, a world's number is out of range, or a belief refuses its frame.
-    pub fn update(&mut self, observed: Observed<'_>, plans: bool) -> Result<()> {
-        let n_cells = self.setup.shape().n_cells();
-        observed.check(n_cells)?;
-        let is_new = plans && observed.frames.is_some();
-        let shown = self.shown(observed.worlds.len() * usize::from(is_new));
-        let rows = self.rows(observed.worlds)?;
-        let Self {
-            setup,
-            threads,
-            worlds,
-            ..
-        } = self;
-        let tasks = worlds.iter_mut().zip(rows).enumerate();
-        let tasks = tasks.filter_map(|(index, (planned, row))| {
-            let (planned, row) = (planned.as_mut()?, row?);
-            Some(WorldWork {
-                index,
-                planned,
-                observed: observed.row(row, n_cells),
-                plans,
-                is_shown: shown.contains(&row),
-            })
+    /// If the arrays differ in length, or a belief refuses its frame.
+    pub fn update(&mut self, chosen: &[bool], results: &[u8], frames: &[u8]) -> Result<()> {
+        self.check(chosen, results, Some(frames))?;
+        let frames = frames.chunks_exact(self.setup.shape().n_cells());
+        let rows = results.chunks_exact(RESULT_BYTES).zip(frames).zip(chosen);
+        let seen = self.worlds.iter_mut().zip(rows);
+        let seen = seen.filter_map(|(planned, ((result, frame), &chosen))| {
+            Some((planned.as_mut().filter(|_| chosen)?, result, frame))
         });
-        let tasks: Vec<WorldWork<'_>> = tasks.collect();
-        let done = threads.work(is_short(setup.estimator(), tasks.len()), |threads| {
-            work_on(setup, tasks, threads)
-        });
-        let outlooks: Vec<Option<Outlook>> = done.into_iter().collect::<Result<_>>()?;
-        self.show(outlooks.into_iter().flatten());
-        Ok(())
+        let seen: Vec<Seen<'_>> = seen.collect();
+        let is_short = is_short(self.setup.estimator(), seen.len());
+        let setup = &self.setup;
+        self.threads
+            .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Returns, for each world here, its index in `worlds`; `None` if it is not listed there.
-    fn rows(&self, worlds: &[usize]) -> Result<Vec<Option<usize>>> {
-        let mut rows = vec![None; self.worlds.len()];
-        for (row, &world) in worlds.iter().enumerate() {
-            let (place, n_worlds) = (rows.get_mut(world), self.worlds.len());
-            *place.with_context(|| {
-                format!("options: expected a world below {n_worlds}, got {world}")
-            })? = Some(row);
-        }
-        Ok(rows)
+    /// Updates the belief about one world with an earlier step: its result and its frame, `[1, H, W]`.
+    ///
+    /// # Errors
+    /// As for [`Self::update`].
+    pub fn recall(&mut self, world: usize, result: &[u8], frame: &[u8]) -> Result<()> {
+        ensure!(result.len() == RESULT_BYTES, "options: expected one result");
+        let Some(planned) = self.worlds.get_mut(world).and_then(Option::as_mut) else {
+            return Ok(());
+        };
+        let (setup, seen) = (&self.setup, vec![(planned, result, frame)]);
+        let is_short = is_short(setup.estimator(), 1);
+        self.threads
+            .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Returns features `[n_worlds, options, features]` and paths `[n_worlds, options, T]` of the last plans of all
-    /// worlds.
-    pub fn plans(&self) -> (Array3<f32>, Array3<u8>) {
+    /// Plans all options in the chosen worlds. Returns features `[n_worlds, options, features]` and paths
+    /// `[n_worlds, options, T]` of the last plans of all worlds.
+    ///
+    /// # Errors
+    /// If the arrays differ in length.
+    pub fn plan(&mut self, chosen: &[bool], results: &[u8]) -> Result<(Array3<f32>, Array3<u8>)> {
+        self.check(chosen, results, None)?;
+        let rows = results.chunks_exact(RESULT_BYTES).zip(chosen);
+        let planning = self.worlds.iter_mut().zip(rows);
+        let planning = planning.filter_map(|(planned, (result, &chosen))| {
+            Some((
+                planned.as_mut().filter(|_| chosen)?,
+                parsed(result).1.cell(),
+            ))
+        });
+        let planning: Vec<_> = planning.collect();
+        let is_short = is_short(self.setup.estimator(), planning.len());
+        self.threads.work(is_short, |threads| {
+            threads.each(planning, |(planned, robot)| planned.plan(robot))
+        });
+        Ok(self.plans())
+    }
+
+    fn plans(&self) -> (Array3<f32>, Array3<u8>) {
         let dim = (self.worlds.len(), OPTIONS.len());
         let mut features = Array3::zeros((dim.0, dim.1, N_FEATURES));
         let mut paths = Array3::zeros((dim.0, dim.1, self.setup.n_moves()));
@@ -180,113 +142,40 @@ impl PlannedWorlds {
         (features, paths)
     }
 
-    /// Returns which of the rows 0 to `n_worlds - 1` to publish now. The first call opens the channel.
-    fn shown(&mut self, n_worlds: usize) -> Vec<usize> {
-        let begun = self.worlds.iter().flatten().next();
-        let (Some(watched), Some(begun)) = (&mut self.watched, begun) else {
-            return Vec::new();
-        };
-        let belief = || begun.agent().belief().probabilities();
-        let feed = watched
-            .feed
-            .get_or_insert_with(|| Feed::open(&watched.instance, belief()));
-        if n_worlds == 0 {
-            Vec::new()
-        } else {
-            feed.due(n_worlds)
-        }
-    }
-
-    fn show(&mut self, outlooks: impl Iterator<Item = Outlook>) {
-        let Some(watched) = &mut self.watched else {
-            return;
-        };
-        for outlook in outlooks {
-            let world = watched.first_world + outlook.index as u32;
-            let view = View {
-                world,
-                robots: world..world + 1,
-                result: &outlook.world,
-                belief: outlook.belief.probabilities(),
-                intent: outlook.intent,
-            };
-            if let Some(feed) = &mut watched.feed {
-                feed.show(&view);
-            }
-        }
-    }
-}
-
-impl<'a> Observed<'a> {
-    fn check(&self, n_cells: usize) -> Result<()> {
-        let n_worlds = self.worlds.len();
+    fn check(&self, chosen: &[bool], results: &[u8], frames: Option<&[u8]>) -> Result<()> {
+        let (n_worlds, n_cells) = (self.worlds.len(), self.setup.shape().n_cells());
         ensure!(
-            self.results.len() == n_worlds * RESULT_BYTES
-                && self.frames.is_none_or(|it| it.len() == n_worlds * n_cells)
-                && self.flown.is_none_or(|it| it.len() == n_worlds),
-            "options: expected a result, a frame and an option for each of {n_worlds} worlds, got other lengths"
+            chosen.len() == n_worlds
+                && results.len() == n_worlds * RESULT_BYTES
+                && frames.is_none_or(|it| it.len() == n_worlds * n_cells),
+            "options: expected a result and a frame for each of {n_worlds} worlds, got other lengths"
         );
         Ok(())
     }
-
-    fn row(&self, row: usize, n_cells: usize) -> Row<'a> {
-        let result = &self.results[row * RESULT_BYTES..][..RESULT_BYTES];
-        let (world, robot) = result.split_at(WORLD_BYTES);
-        Row {
-            world: bytemuck::pod_read_unaligned(world),
-            robot: bytemuck::pod_read_unaligned(robot),
-            frame: self.frames.map(|it| &it[row * n_cells..][..n_cells]),
-            flown: self.flown.map(|it| it[row]),
-        }
-    }
 }
 
-/// Corrects and predicts the beliefs, then plans. Worlds with a refused frame stay unchanged.
-fn work_on(
-    setup: &OptionSetup,
-    mut tasks: Vec<WorldWork<'_>>,
-    threads: Threads,
-) -> Vec<Result<Option<Outlook>>> {
-    let seen = threads.each(&mut tasks, |task| task.see(setup));
-    let fits = tasks
-        .into_iter()
-        .zip(&seen)
-        .filter(|(_, seen)| seen.is_ok());
-    let mut tasks: Vec<_> = fits.map(|(task, _)| task).collect();
-    let new = tasks
-        .iter_mut()
-        .filter(|task| task.observed.frame.is_some());
-    let new = new.map(|task| &mut *task.planned);
-    match threads {
-        Threads::Several => OptionAgent::predict_all(new),
-        Threads::One => new.for_each(|planned| OptionAgent::predict_all([planned])),
-    }
-    let planning = tasks.into_iter().filter(|task| task.plans);
-    threads.each(planning, |task| {
-        task.planned.plan(task.observed.robot.cell())
+/// Corrects and predicts the beliefs.
+fn update(setup: &OptionSetup, mut seen: Vec<Seen<'_>>, threads: Threads) -> Result<()> {
+    let corrected = threads.each(&mut seen, |(planned, result, frame)| {
+        let (world, robot) = parsed(result);
+        planned.see(&Shown {
+            frame: Frame::from_bytes(setup.shape(), setup.model().n_observations(), frame)?,
+            reward: (world.step > 0).then_some(robot.reward),
+        })
     });
-    seen
+    let fits = seen.into_iter().zip(&corrected);
+    let fits = fits.filter_map(|((planned, ..), it)| it.is_ok().then_some(planned));
+    match threads {
+        Threads::Several => OptionAgent::predict_all(fits),
+        Threads::One => fits.for_each(|planned| OptionAgent::predict_all([planned])),
+    }
+    corrected.into_iter().collect()
 }
 
-impl WorldWork<'_> {
-    /// Corrects the belief with the frame, if there is one.
-    fn see(&mut self, setup: &OptionSetup) -> Result<Option<Outlook>> {
-        let Some(frame) = self.observed.frame else {
-            return Ok(None);
-        };
-        let intent = self
-            .is_shown
-            .then(|| self.planned.intent(self.observed.flown));
-        let n_observations = setup.model().n_observations();
-        self.planned.see(&Shown {
-            frame: Frame::from_bytes(setup.shape(), n_observations, frame)?,
-            reward: (self.observed.world.step > 0).then_some(self.observed.robot.reward),
-        })?;
-        Ok(intent.map(|intent| Outlook {
-            index: self.index,
-            world: self.observed.world,
-            belief: self.planned.agent().belief().clone(),
-            intent,
-        }))
-    }
+fn parsed(result: &[u8]) -> (WorldResult, RobotResult) {
+    let (world, robot) = result.split_at(WORLD_BYTES);
+    (
+        bytemuck::pod_read_unaligned(world),
+        bytemuck::pod_read_unaligned(robot),
+    )
 }

@@ -2,17 +2,16 @@
 
 use crate::errors::{no_memory, no_threads, raise, warn};
 use crate::model::shape_of;
+use crate::records;
 use crate::refusal::{failed, refused};
 use emberwatch_model::Model;
 use emberwatch_model::hazards::Hazards;
-use emberwatch_model::settings::{Settings as _, WorldSettings};
 use emberwatch_sim::config::{Checked, model_named};
 use emberwatch_sim::embedded::Embedded;
 use emberwatch_sim::embedded::settings::{self, LONGEST_READ, ReadError};
 use emberwatch_sim::snapshot::Settings;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
-use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// Settings of worlds in this process, with the files that they name, which are read only here.
@@ -50,19 +49,10 @@ impl CheckedSettings {
         })
     }
 
-    /// All settings as JSON, with every default filled in.
+    /// The `ServerInfo` of a server with these settings.
     #[getter]
-    fn settings(&self) -> String {
-        serde_json::to_string(&self.checked.config).expect("invariant: settings serialise")
-    }
-
-    /// The text of the model file, with the maps from other files included; for recorded states, of their description.
-    #[getter]
-    fn description(&self) -> String {
-        match &self.checked.recorded {
-            Some(states) => states.description.clone(),
-            None => text_of(&self.checked.model),
-        }
+    fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        records::server_info(py, &self.checked.info())
     }
 
     /// `None` if the settings have no task.
@@ -119,13 +109,6 @@ impl CheckedSettings {
         let given = settings.into();
         Ok(Self { given, checked })
     }
-}
-
-/// Returns the range of each setting of worlds, by name; `None` unless the setting is a number.
-#[pyfunction]
-pub fn world_settings() -> BTreeMap<&'static str, Option<(i128, i128)>> {
-    let settings = WorldSettings::settings().into_iter();
-    settings.map(|it| (it.name, it.range)).collect()
 }
 
 /// Reads settings again for a copy in another process. Refuses files that have changed since `fingerprint` was made.

@@ -20,11 +20,9 @@ class Parameters(NamedTuple):
     #: ``P(observed value | state)``: one row per state.
     observed: Array
     initial: Array
-    #: Factors by name, for a model of hazards.
-    maps: dict[str, Array]
 
 
-def parameters(text: str, maps: dict[str, Array] | None = None) -> Parameters:
+def parameters(text: str) -> Parameters:
     file: dict[str, Any] = tomllib.loads(text)
     states, entries = file["states"], file.get("kernel", ())
     names = [state["name"] for state in states]
@@ -43,7 +41,6 @@ def parameters(text: str, maps: dict[str, Array] | None = None) -> Parameters:
         np.array([state.get("bias", 0.0) for state in states]),
         observed / observed.sum(axis=1, keepdims=True),
         initial / initial.sum(),
-        maps or {},
     )
 
 
@@ -58,9 +55,8 @@ def with_fourth_observation(text: str) -> str:
 
 
 def phi(model: Parameters, belief: Array) -> Array:
-    """Predicts: by eqs. 2 to 4, or by hazards of independent neighbours."""
-    if model.kernel is None:
-        return _by_hazards(model, belief)
+    """Predicts with a kernel (eqs. 2 to 4)."""
+    assert model.kernel is not None
     n_states, height, width = belief.shape
     weights = np.tile(model.bias[:, np.newaxis, np.newaxis], (1, height, width))
     for row, col in np.ndindex(model.kernel.shape[2:]):
@@ -74,36 +70,6 @@ def _neighbour(belief: Array, size: tuple[int, ...], row: int, col: int) -> Arra
     above, left = size[0] // 2, size[1] // 2
     padded = np.pad(belief, ((0, 0), (above, above), (left, left)))
     return padded[:, row : row + height, col : col + width]
-
-
-def _by_hazards(model: Parameters, belief: Array) -> Array:
-    following = np.zeros_like(belief)
-    for own, name in enumerate(model.names):
-        base, last = np.zeros(belief.shape[1:]), np.ones(belief.shape[1:])
-        near = dict[tuple[int, int], Array]()
-        for entry in (it for it in model.file["transitions"] if it["from"] == name):
-            factors = [model.maps[key] for key in entry.get("times", ())]
-            everywhere = np.ones(belief.shape[1:])
-            for factor in (it for it in factors if it.ndim == 2):
-                everywhere = everywhere * factor
-            base = base - np.log1p(-entry.get("base", 0.0)) * everywhere
-            for state, table in entry.get("near", {}).items():
-                hazards = -np.log1p(-np.array(table, float))
-                for row, col in np.ndindex(hazards.shape):
-                    place = row - hazards.shape[0] // 2, col - hazards.shape[1] // 2
-                    of_place = near.setdefault(place, np.zeros_like(belief))
-                    by_place = [it[row, col] for it in factors if it.ndim == 4]
-                    product = np.prod([everywhere, *by_place], axis=0)
-                    of_place[model.names.index(state)] += hazards[row, col] * product
-            none = np.exp(-base)
-            for (down, right), hazards in near.items():
-                size = 2 * abs(down) + 1, 2 * abs(right) + 1
-                neighbour = _neighbour(belief, size, down + size[0] // 2, right + size[1] // 2)
-                none = none * (1.0 + (neighbour * np.expm1(-hazards)).sum(axis=0))
-            following[model.names.index(entry["to"])] += belief[own] * (last - none)
-            last = none
-        following[own] += belief[own] * last
-    return following
 
 
 def bayes(model: Parameters, belief: Array, frame: NDArray[np.uint8]) -> Array:

@@ -7,10 +7,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import land
 import numpy as np
-import oracle
 import pytest
 from environments import (
     LIVELY,
@@ -19,7 +17,6 @@ from environments import (
     WILDFIRE,
     actions,
     assert_same,
-    closed_later,
     make,
     rollout,
     serving,
@@ -27,9 +24,7 @@ from environments import (
 from failures import refuses
 from gymnasium.utils.env_checker import check_env
 
-from emberwatch._native import Flights, built_in
-from emberwatch.belief import known
-from emberwatch.belief.prior import simulated_prior
+from emberwatch._native import Flights
 from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace
 
@@ -147,17 +142,6 @@ def test_a_radius_can_be_combined_with_a_model() -> None:
         assert env.unwrapped.model.sensor_radius == 2
 
 
-def test_a_task_has_its_own_radius(tmp_path: Path) -> None:
-    far = tmp_path / "far.toml"
-    far.write_text(built_in("tasks")["small"].replace('"small"', '"far"') + "sensor_radius = 2\n")
-    env = closed_later(gymnasium.make(WILDFIRE, task=far))
-    assert env.unwrapped.model.sensor_radius == 2
-    assert env.unwrapped.world_spec.airspace == Airspace(radius=2)
-    far.write_text(far.read_text().replace("radius = 2", "radius = 9"))
-    with refuses("sensor_radius: expected -1 to 8, got 9"):
-        gymnasium.make(WILDFIRE, task=far)
-
-
 def test_recorded_worlds_support_sensor_radius(tmp_path: Path) -> None:
     path = tmp_path / "lab.npy"
     np.save(path, np.random.default_rng(1).integers(0, 3, (20, *SHAPE), np.uint8))
@@ -178,8 +162,6 @@ def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     assert whole.kernel is not None and whole.kernel.shape == (3, 3, 3, 3)
     assert whole.observation_names == ("normal", "latent", "fire")
     assert whole.observation_colors == whole.state_colors
-    expected = oracle.parameters(whole.toml)
-    assert np.array_equal(whole.observation_matrix, expected.observed)
     # A map in a file next to the model file equals a map in it.
     path = tmp_path / "model.toml"
     path.write_text(land.model(radius=3, no_fly="no_fly.npy"))
@@ -189,9 +171,6 @@ def test_a_model_has_the_contents_of_its_file(tmp_path: Path) -> None:
     assert whole != Model.from_toml(land.model(radius=3))
     with refuses("emberwatch-server --check"):
         Model.from_toml(path.read_text())
-    (tmp_path / "no_fly.npy").unlink()
-    with refuses("no_fly.npy"):
-        Model.named(path)
     plain = Model.wildfire()
     assert (plain.airspace, plain.maps) == (Airspace(), {})
     assert plain.with_radius(0) is plain
@@ -215,30 +194,6 @@ def test_a_model_carries_its_maps(tmp_path: Path) -> None:
     assert env.unwrapped.model == model
     land.write_hazards(tmp_path, 2)
     assert Model.named(path) != model
-    np.savez(tmp_path / "land.npz", fuel=np.ones((7, 5)), wind=np.ones((3, 7, 5)))
-    with refuses(r'maps: "wind": expected shape \[H, W\] or \[KH, KW, H, W\]'):
-        Model.named(path)
-    (tmp_path / "land.npz").write_bytes(b"no archive")
-    with refuses(r"land.npz: expected an \.npz \(zip\) archive"):
-        Model.named(path)
-
-
-def test_the_filter_uses_maps(tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    path = land.write_hazards(tmp_path, 3)
-    maps = {name: factors.astype(float) for name, factors in land.maps(3).items()}
-    model, expected = Model.named(path), oracle.parameters(land.HAZARDS, maps)
-    belief = np.moveaxis(rng.dirichlet(np.ones(3), SHAPE), -1, 0)
-    frame = rng.choice(np.array([*range(3), 255], np.uint8), SHAPE)
-    kept = known(model, prior=belief, kind="known")
-    kept.correct(frame)
-    posterior = kept.belief
-    np.testing.assert_allclose(posterior, oracle.bayes(expected, belief, frame), atol=1e-6)
-    kept.predict()
-    np.testing.assert_allclose(kept.belief, oracle.phi(expected, posterior), atol=1e-6)
-    assert simulated_prior(model, height=7, width=5, burn_in=20).shape == (3, 7, 5)
-    with refuses("maps: expected a map of the 5 x 5 grid, got 7 x 5"):
-        known(model, prior=np.full((3, 5, 5), 1 / 3))
 
 
 def test_an_invalid_airspace_is_refused() -> None:
@@ -268,6 +223,3 @@ def test_an_enclosed_start_causes_a_warning(tmp_path: Path) -> None:
         assert env.reset(seed=1)[0]["robot"].tolist() == [4, 4]
         make(**pocket, start="centre").reset(seed=1)
     assert not [each for each in found if "start" in str(each.message)], "once, when it is made"
-    env = make(**pocket, start="random")
-    starts = {tuple(env.reset(seed=seed)[0]["robot"].tolist()) for seed in range(200)}
-    assert len(starts) > 50 and not starts & {(4, 4), (4, 5)}

@@ -210,18 +210,12 @@ def test_wrong_settings_are_refused(client: emberwatch.Client) -> None:
         client.truths(range(1))
     with fails("invalid_argument", match="^instance: expected an environment made with instance="):
         _ = make().unwrapped.instance
-    left_out = {"snapshot_keep": 9, "deadline_millis": 7, "instance": "lab", "restore": "file"}
-    rows = [
-        ({name: value}, f"^{name}: expected to be left out") for name, value in left_out.items()
-    ]
     for settings, words in (
-        *rows,
+        ({"snapshot_keep": 9}, "^snapshot_keep: expected to be left out"),
         ({"snapshot_every": 5, "snapshot_dir": "."}, "snapshot_every: expected to be left out"),
         ({"model": "\ud800"}, "model: expected UTF-8"),
         ({"wrolds": 2}, "^wrolds: expected the name of a setting \\(burn_in, .*\\), got 2$"),
-        ({"height": -1}, "^height: expected 1 to 4096, got -1$"),
         ({"height": 7.0}, "^height: expected an integer, True or False, text or a path, got 7.0$"),
-        ({"publish_truth": 1}, "^publish_truth: expected true or false, got 1$"),
     ):
         with fails("invalid_argument", match=words):
             emberwatch.embed(**settings)
@@ -326,17 +320,6 @@ def test_files_are_read_once(
         pickle.loads(pickled)
 
 
-def test_a_copy_in_another_process_refuses_changed_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_files(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    pickled = pickle.dumps(of_files("model", "path"))
-    (tmp_path / "model.toml").write_text(Model.named("wildfire").toml)
-    with refuses("the file of their task, model or states has changed since they were made"):
-        pickle.loads(pickled)
-
-
 def test_a_model_is_given_as_such_or_as_text() -> None:
     model = Model.named("wildfire-small")
     worlds = {**SMALL, "model": "wildfire-small"}
@@ -345,7 +328,3 @@ def test_a_model_is_given_as_such_or_as_text() -> None:
         env = make(**{**worlds, "model": given})
         assert env.unwrapped.model == model
         assert_same(rollout(env, 8, seed=1), expected)
-        again = closed_later(type(env.spec).from_json(env.spec.to_json()).make())
-        assert_same(rollout(again, 8, seed=1), expected)
-    with emberwatch.embed(model=model, height=16, width=16) as client:
-        assert client.info.model is not None

@@ -38,13 +38,6 @@ def test_max_episode_steps_counts_moves() -> None:
     assert gymnasium.spec(MOVES).max_episode_steps == 64_000
 
 
-def test_moves_may_be_any_integer_type() -> None:
-    env = make(MOVES)
-    for kind in (int, np.int64, np.uint8, np.array, lambda n: np.array([n])):
-        env.reset(seed=1)
-        assert env.step(kind(1))[0]["robot"].tolist() == [1, 0]
-
-
 def test_move_rewards_need_published_truth_and_a_model() -> None:
     with serving() as instance, refuses("expected a server started with --publish-truth"):
         make(MOVES, instance=instance, reward="move")

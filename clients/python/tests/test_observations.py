@@ -4,7 +4,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from environments import (
@@ -144,7 +143,7 @@ def test_rows_of_different_steps_join_together(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(
             Observations,
             "update",
-            lambda self, moved, frames: (updates.append(moved), update(self, moved, frames)),
+            lambda self, moved, *seen: (updates.append(moved), update(self, moved, *seen)),
         )
         second = make_vec(3, instance=instance, observation=OF_PATHS)
         assert_same(second.reset(options={"resume": True})[0], last)
@@ -210,15 +209,3 @@ def test_a_belief_never_continues_another_episode_with_the_same_last_frame() -> 
             assert_same(joined, last[1])
             n_same += np.array_equal(last[0]["frame"], last[1]["frame"])
         assert n_same > 0
-
-
-def test_fires_persist_in_small_worlds() -> None:
-    keywords = {**SMALL, "n_moves": 1, "burn_in": 1000}
-    worlds = gymnasium.make_vec(WILDFIRE, num_envs=50, max_episode_steps=-1, truth=True, **keywords)
-    _, infos = worlds.reset(seed=1000)
-    fires = [infos["n_target_cells"]]
-    for _ in range(300):
-        fires.append(worlds.step(np.zeros((50, 1), np.int64))[4]["n_target_cells"])
-    worlds.close()
-    assert (np.array(fires) > 0).mean() >= 0.97
-    assert 0.05 < np.mean(fires) / 12**2 < 0.3

@@ -20,13 +20,6 @@ from emberwatch.client.client import connect
 US = os.getpid()
 
 
-def test_a_missing_server_is_named_with_a_remedy() -> None:
-    with pytest.raises(errors.NoServerError) as raised:
-        connect("nobody-here")
-    assert "'nobody-here'" in str(raised.value)
-    assert "emberwatch-server --instance nobody-here" in str(raised.value)
-
-
 def test_connect_waits_for_a_server_that_starts_later(caplog: pytest.LogCaptureFixture) -> None:
     instance = unused_instance()
     with ThreadPoolExecutor() as threads:

@@ -32,7 +32,7 @@ def begun(env: Any) -> None:
 
 def moved(env: Any) -> None:
     """Interrupts a step after its answer."""
-    interrupted(env, "_update", lambda: env.step(PATH))
+    interrupted(env, "_take", lambda: env.step(PATH))
 
 
 def torn(env: Any) -> None:

@@ -1,4 +1,4 @@
-"""The stub of the native module tells the truth: names, parameters and defaults are the module's."""
+"""The stub of the native module names what the module has: parameters and defaults, too."""
 
 import subprocess
 import sys

@@ -50,16 +50,6 @@ def test_team_frames_combine_the_robots_frames() -> None:
     assert (flown.frames == lease.observe().frames.reshape(2, 3, 5, 7).min(axis=1)).all()
 
 
-def test_each_robot_can_leave_a_belief() -> None:
-    client = server(robots=2).connect()
-    lease = client.acquire(0, 2)
-    results = lease.step(paths(2))
-    for robot in range(2):
-        lease.leave_belief(results.result(robot), "bytes", bytes([robot]) * 9, robot=robot)
-    left = [client.belief(robot) for robot in range(2)]
-    assert [one and one.data for one in left] == [bytes(9), b"\1" * 9]
-
-
 def test_a_team_is_evaluated_as_a_whole(tmp_path: Path) -> None:
     def fly(_: Any) -> np.ndarray:
         return np.tile(np.array([[1, 1, 1, 1], [1, 1, 3, 3]]), (len(_["robot"]) // 2, 1))

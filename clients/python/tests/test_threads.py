@@ -145,16 +145,14 @@ def test_threads_that_step_one_environment_take_turns(kind: str) -> None:
     assert_same(first, [alone.reset(seed=1001), *(alone.step(action) for _ in range(8))])
 
 
-@pytest.mark.parametrize("height", [7, 130])  # 7, and more than 16,384 cells in total
-def test_another_thread_can_read_masks_and_partial_paths(height: int) -> None:
-    envs = make_vec(2, MOVES, height=height, width=height)
+def test_another_thread_can_read_masks_and_partial_paths() -> None:
+    envs = make_vec(2, MOVES)
     envs.reset(seed=1000)
     flights = envs.unwrapped._flights
 
     def watch() -> None:
         assert envs.unwrapped.action_masks().shape == (2, 4)
-        assert flights.visited.shape == (2, height, height)
-        assert pickle.dumps(flights) and flights.robots.shape == (2, 2)
+        assert flights.visited.shape == (2, 7, 5) and flights.robots.shape == (2, 2)
 
     with repeated(watch):
         for _ in range(400):

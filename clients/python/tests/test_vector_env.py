@@ -16,7 +16,6 @@ from environments import (
     assert_same,
     make,
     make_vec,
-    no_warnings,
     serving,
 )
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
@@ -150,20 +149,6 @@ def test_a_reset_mask_is_not_changed() -> None:
     assert options["reset_mask"].tolist() == [True, False]
 
 
-def test_resume_continues_the_current_episodes() -> None:
-    with serving(worlds=3) as instance:
-        first = make_vec(3, instance=instance, observation=PARTS)
-        first.reset(seed=1)
-        last = [first.step(action) for action in actions(first, 3)][-1]
-        first.close()
-        second = make_vec(3, instance=instance, observation=PARTS, max_episode_steps=2)
-        observations, infos = second.reset(options={"resume": True})
-        assert_same(infos, last[4])
-        assert_same(observations, last[0])
-        truncations = [second.step(action)[3] for action in actions(second, 2)]
-        assert np.array(truncations).tolist() == [[False] * 3, [True] * 3]
-
-
 def test_an_episode_that_ended_before_does_not_end_at_a_move() -> None:
     with serving(worlds=2, max_steps=1) as instance:
         first = make_vec(2, MOVES, instance=instance, autoreset_mode="Disabled")
@@ -214,42 +199,6 @@ def test_returned_arrays_are_writable_and_never_change(
     assert_same([value for value in returned if len(value) == 5], kept)
 
 
-def test_the_registry_sets_spec_and_metadata() -> None:
-    with no_warnings():
-        env = make_vec(3)
-    assert isinstance(env, emberwatch.WildfireVectorEnv)
-    assert env.spec is not None and env.spec.id == WILDFIRE
-    assert env.spec.kwargs["num_envs"] == 3
-    assert env.spec.kwargs["vectorization_mode"] == "vector_entry_point"
-    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert env.num_envs == 3 and "Wildfire-v0, num_envs=3" in repr(env)
-    env.reset(seed=1)
-    again = gymnasium.make_vec(env.spec)
-    assert_same(again.reset(seed=1), env.reset(seed=1))
-
-
-def test_the_registrys_time_limit_is_the_default() -> None:
-    def n_steps_of(**keywords: Any) -> int:
-        env = make_vec(1, **keywords)
-        env.reset(seed=1)
-        still = np.zeros((1, 4), int)
-        taken = next((n for n in range(1, 1101) if env.step(still)[3][0]), 0)
-        env.close()
-        return taken
-
-    assert [n_steps_of(), n_steps_of(max_episode_steps=7)] == [1000, 7]
-    assert [n_steps_of(max_episode_steps=endless) for endless in (None, -1)] == [0, 0]
-
-
-def test_vector_wrappers_work() -> None:
-    env = gymnasium.wrappers.vector.FlattenObservation(make_vec(2, observation=PARTS))
-    for observation in (env.reset(seed=1)[0], env.step(env.action_space.sample())[0]):
-        assert observation in env.observation_space
-    env.close()
-    recorder = gymnasium.wrappers.vector.DictInfoToList(make_vec(2))
-    assert [info["step"] for info in recorder.reset(seed=1)[1]] == [0, 0]
-
-
 @pytest.mark.parametrize("name", [WILDFIRE, OBJECTIVE])
 def test_pictures_equal_those_of_single_environments(name: str) -> None:
     keywords = {**ALL[name], "render_mode": "rgb_array", "truth": True, "max_episode_steps": 3}
@@ -263,19 +212,6 @@ def test_pictures_equal_those_of_single_environments(name: str) -> None:
         ours.step(action)
         theirs.step(action)
         assert_same(ours.render(), theirs.render(), f"step {step}")
-
-
-def test_texts_and_windows_are_shown() -> None:
-    with no_warnings():
-        env = make_vec(2, render_mode="ansi")
-        env.reset(seed=1)
-        texts = env.render()
-        assert texts is not None and [type(text) for text in texts] == [str, str]
-        env.close()
-        env = make_vec(2, render_mode="human")
-        env.reset(seed=1)
-        env.step(np.zeros((2, 4), int))
-        assert env.render() == (None, None)
 
 
 @by_name

@@ -20,6 +20,7 @@ LAYOUTS = document.layouts()
 #: A flag of requests.
 TEAM_FRAMES = 2
 
+
 def test_every_status_has_an_error_with_name_code_and_detail() -> None:
     ok, *refusals = document.table("| status | code |")
     assert (ok[:2], _native.explain(0, 0)) == (["ok", "0"], None)

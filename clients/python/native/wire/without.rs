@@ -1,18 +1,13 @@
-//! Stand-ins for `wire` on systems other than Linux, where connecting and publishing are impossible.
+//! Stand-ins for `wire` on systems other than Linux, where connecting is impossible.
 
-use emberwatch_messages::agent_belief::Intent;
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::{ChannelError, ConnectionError};
 use emberwatch_messages::instance::Instance;
-use emberwatch_messages::message::{
-    AgentHeader, FrameHeader, StepRequest, TruthHeader, WorldResult,
-};
+use emberwatch_messages::message::{AgentHeader, FrameHeader, StepRequest, TruthHeader};
 use emberwatch_messages::sample::Sample;
-use emberwatch_model::Probabilities;
 use std::convert::Infallible;
 use std::marker::PhantomData;
-use std::ops::Range;
 use std::time::Duration;
 
 /// A connection, which cannot exist on these systems.
@@ -81,32 +76,6 @@ impl<H> Observer<H> {
     ) -> Result<Option<(Sample<H>, u64)>, ConnectionError> {
         match self.0 {}
     }
-}
-
-/// A channel that publishes nothing, because nobody can observe it.
-pub struct Feed;
-
-/// A belief for observers.
-#[expect(dead_code, reason = "nobody reads it here")]
-pub struct View<'a> {
-    pub world: u32,
-    pub robots: Range<u32>,
-    pub result: &'a WorldResult,
-    pub belief: &'a Probabilities,
-    pub intent: Intent,
-}
-
-impl Feed {
-    pub fn open(_: &Instance, _: &Probabilities) -> Self {
-        Self
-    }
-
-    /// Returns an empty list, because no world is ever published.
-    pub fn due(&self, _: usize) -> Vec<usize> {
-        Vec::new()
-    }
-
-    pub fn show(&mut self, _: &View<'_>) {}
 }
 
 fn refusal(instance: &Instance) -> ChannelError {

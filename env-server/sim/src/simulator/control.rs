@@ -3,6 +3,8 @@
 use super::lease::{Claim, ClientId};
 use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot, cells};
+use crate::config::Checked;
+use crate::snapshot::Settings;
 use crate::world::WorldOutcome;
 use emberwatch_messages::capacity::MAX_CLIENTS;
 use emberwatch_messages::control::{
@@ -239,38 +241,7 @@ impl Simulator {
 
     /// Returns the server's answer to `hello`.
     pub fn info(&self) -> ServerInfo {
-        let (config, file) = (&self.checked.config, self.checked.model.file());
-        let recorded = &self.checked.recorded;
-        ServerInfo {
-            protocol: VERSION,
-            build: env!("CARGO_PKG_VERSION").into(),
-            pid: std::process::id(),
-            pid_namespace: pid_namespace(),
-            height: config.world.height,
-            width: config.world.width,
-            n_moves: config.world.moves,
-            n_worlds: config.worlds,
-            n_robots: config.world.robots,
-            n_observations: self.checked.model.n_observations(),
-            observations: self.checked.model.observation_names(),
-            model: (config.reveal_model && recorded.is_none())
-                .then(|| toml::to_string(file).expect("invariant: model files serialise")),
-            task: self.checked.task.as_ref().map(|task| task.name.clone()),
-            worlds_fingerprint: Some(self.spec.settings.worlds_fingerprint()),
-            airspace: airspace_info(&self.checked.model),
-            recorded_world: recorded.as_ref().map(|states| RecordedWorld {
-                description: config.reveal_model.then(|| states.description.clone()),
-                n_sequences: states.recorded.n_sequences(),
-                n_steps: states.recorded.n_steps(),
-            }),
-            burn_in: config.world.burn_in,
-            max_steps: config.world.max_steps,
-            max_clients: MAX_CLIENTS,
-            coverage: config.coverage,
-            publish_truth: config.publish_truth,
-            lease_millis: config.lease_millis,
-            deadline_millis: config.deadline_millis,
-        }
+        self.checked.info()
     }
 
     fn status(&self, stats: &ServerStats) -> ServerStatus {
@@ -290,6 +261,44 @@ impl Simulator {
             n_clients: stats.n_clients,
             n_observers: stats.n_observers,
             worlds: self.worlds().map(world_status).collect(),
+        }
+    }
+}
+
+impl Checked {
+    /// Returns the answer to `hello` of a server with these settings.
+    pub fn info(&self) -> ServerInfo {
+        let (config, file) = (&self.config, self.model.file());
+        let recorded = &self.recorded;
+        ServerInfo {
+            protocol: VERSION,
+            build: env!("CARGO_PKG_VERSION").into(),
+            pid: std::process::id(),
+            pid_namespace: pid_namespace(),
+            height: config.world.height,
+            width: config.world.width,
+            n_moves: config.world.moves,
+            n_worlds: config.worlds,
+            n_robots: config.world.robots,
+            n_observations: self.model.n_observations(),
+            observations: self.model.observation_names(),
+            model: (config.reveal_model && recorded.is_none())
+                .then(|| toml::to_string(file).expect("invariant: model files serialise")),
+            task: self.task.as_ref().map(|task| task.name.clone()),
+            worlds_fingerprint: Some(Settings::of(self).worlds_fingerprint()),
+            airspace: airspace_info(&self.model),
+            recorded_world: recorded.as_ref().map(|states| RecordedWorld {
+                description: config.reveal_model.then(|| states.description.clone()),
+                n_sequences: states.recorded.n_sequences(),
+                n_steps: states.recorded.n_steps(),
+            }),
+            burn_in: config.world.burn_in,
+            max_steps: config.world.max_steps,
+            max_clients: MAX_CLIENTS,
+            coverage: config.coverage,
+            publish_truth: config.publish_truth,
+            lease_millis: config.lease_millis,
+            deadline_millis: config.deadline_millis,
         }
     }
 }

@@ -5,12 +5,14 @@ from typing import Any, ClassVar, Final, Literal, TypeAlias, cast
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch.client.wire import UNOBSERVED, StepAnswer
-from emberwatch.common.arguments import as_seed
+from emberwatch.common.arguments import as_moves, as_seed
 from emberwatch.envs.observations import Observations
 from emberwatch.envs.owner import SessionOwner
+from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session, not_reset
 from emberwatch.envs.settings import draw_seed
 from emberwatch.envs.view import RENDER_FPS, RENDER_MODES, View
@@ -32,28 +34,76 @@ ONE_ROW: Final = np.ones(1, np.bool_)
 class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """An environment of one robot, in its own world or in a world of a running server."""
 
-    #: Missing in environments that plan, which refuse `clone_state`.
-    _observations: Observations
-
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "render_modes": list(RENDER_MODES),
         "render_fps": RENDER_FPS,
     }
 
-    def __init__(self, session: Session) -> None:
+    def __init__(
+        self,
+        session: Session,
+        observations: Observations | Plans,
+        action_space: spaces.Space[Any],
+        *,
+        pays: int,
+    ) -> None:
+        """`pays` is the kind of reward, an index in `REWARDS`."""
         self._session = session
         self._spec: Final = session.spec
+        self._observations = observations
+        self._pays = pays
+        self.observation_space = observations.space
+        self.action_space = action_space
         self.render_mode = session.settings.render_mode
         self._view = View(self.render_mode, self._spec)
         self._reveals = session.settings.reveals
         #: The robot's index in a world that other clients fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
+        #: Whether observations contain the robot's teammates, whom another client may fly.
+        self._needs_teams = self._robot is not None and observations.shows_team
         self._n_missed = 0
         #: Whether the last reset continued the episode where this environment left it.
         self.continues = False
         self._answer: StepAnswer | None = None
+        self._teams: StepAnswer | None = None
         self._truth: NDArray[np.uint8] | None = None
         self._path: NDArray[np.intp] | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode, or with `robot` joins the current episode of the shared world.
+
+        See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
+        """
+        with self._session.turn:
+            self._answer = answer = self._begin(seed, options)
+            if not self.continues:
+                self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
+                self._take(answer)
+            seen = self._seen()
+            self._session.finish()
+        return seen
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Flies a path of T moves.
+
+        Raises:
+            InvalidArgumentError: If the action is not in the action space. Nothing is sent.
+            LeaseLostError: If another client took over the world.
+            ServerGoneError: If the server has ended. The next reset attaches to a new server of
+                the same instance.
+            RequestTimeoutError: If the server does not answer. The world may have moved: reset or
+                resume.
+            EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
+                for example after Ctrl-C: reset or resume. Nothing is sent.
+        """
+        session = self._session
+        with session.turn:
+            session.begin_step()
+            outcome = self._fly(action)
+            session.finish()
+        return outcome
 
     def render(self) -> Any:
         """Draws the last frame, path and robot; next to them the hidden states, if revealed."""
@@ -97,9 +147,6 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
             self._path, self._n_missed = None, 0
         return answer
 
-    def _form(self) -> str:
-        return f"{type(self).__name__} with {self._observations.form}"
-
     def _memory(self) -> dict[str, Any]:
         return {
             "generator": (self.np_random, self._np_random_seed),
@@ -108,43 +155,58 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         }
 
     def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
-        self._answer, self._path = answer, memory["path"]
+        self._path = memory["path"]
         self._np_random, self._np_random_seed = memory["generator"]
         self._truth = self._session.truth(answer)[0] if self._reveals else None
-        self._begin_path(answer)
-        self._observations.restore(memory["observations"])
+        self._take(answer)
+        self._observations.restore(memory["observations"], answer.results)
 
-    def _begin_path(self, answer: StepAnswer) -> None:
-        """Begins the paths of environments of moves."""
-
-    def _update(self, observations: Observations, answer: StepAnswer) -> None:
-        """Updates the observations with one empty frame per missed step, then with `answer`."""
+    def _fly(self, path: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Flies a path, and returns the outcome of the step."""
+        answer = self._session.step(path)
         if self._robot is not None:
-            stayed = int(answer.robots["n_moves"][0]) == 0
-            self._n_missed = self._session.n_skipped + stayed
-        for _ in range(self._session.n_skipped):
-            observations.update(ONE_ROW, np.full_like(answer.frames, UNOBSERVED))
-        observations.update(ONE_ROW, answer.frames)
+            self._n_missed = self._session.n_skipped + (int(answer.robots["n_moves"][0]) == 0)
+        if self._observations.has_memory:
+            for _ in range(self._session.n_skipped):
+                unseen = np.full_like(answer.frames, UNOBSERVED)
+                self._observations.update(ONE_ROW, answer.results, unseen)
+            self._observations.update(ONE_ROW, answer.results, answer.frames)
+        if self.render_mode is not None:
+            robot, moves = answer.result().robot, as_moves(path, 1, self._spec.n_moves)
+            self._path = fly(robot.start, moves.reshape(-1)[: robot.n_moves], self._spec)
+        self._take(answer)
+        reward, terminated, truncated, *_ = self._numbers
+        observation, info = self._seen()
+        return observation, reward, terminated, truncated, info
 
-    def _teams(self, observations: Observations, answer: StepAnswer) -> StepAnswer | None:
-        """Returns the team's results and frame; None if no observation part needs them."""
-        is_needed = self._robot is not None and observations.shows_team
-        return self._session.teams(answer) if is_needed else None
+    def _take(self, answer: StepAnswer) -> None:
+        """Stores the results of the current step."""
+        self._answer = answer
+        self._numbers = answer.numbers(self._pays)
+        if self._needs_teams:
+            self._teams = self._session.teams(answer)
 
-    def _trace(self, answer: StepAnswer, path: NDArray[np.uint8]) -> None:
-        """Stores the cells of a path that was flown, for pictures."""
-        robot = answer.result().robot
-        self._path = fly(robot.start, path[: robot.n_moves], self._spec)
+    def _seen(self) -> tuple[Any, dict[str, Any]]:
+        """Returns the observation and the info."""
+        assert self._answer is not None
+        frames, info = self._answer.frames, self._info()
+        if self.render_mode is not None:
+            frames = frames.copy()  # the learner may write to it, and pictures show the original
+            if self.render_mode == "human":
+                self._draw()
+        return self._observations.one(frames, self._numbers[5], self._teams), info
 
-    def _describe(self, answer: StepAnswer, step: int, n_visited: int) -> dict[str, Any]:
+    def _info(self) -> dict[str, Any]:
         """Returns the info of a step, never with the seed, which reveals the hidden states."""
+        _, _, _, step, n_visited, _ = self._numbers
         info: dict[str, Any] = {"step": step, "n_visited": n_visited}
         if self._robot is not None:
             info["n_missed"] = self._n_missed
         if self._reveals:
-            world, robot = answer.result()
+            assert self._answer is not None
+            world, robot = self._answer.result()
             info |= {"n_target_cells": world.n_target_cells, "n_hits": robot.n_hits}
-            self._truth = truth = self._session.truth(answer)[0]
+            self._truth = truth = self._session.truth(self._answer)[0]
             info["truth"] = truth.copy()
         return info
 

@@ -42,14 +42,6 @@ class LastSeen:
         self.ages[seen] = 0
         self._values[seen] = frames[seen]
 
-    def memory(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Returns the last values and their ages, for `restore`."""
-        return self._values, self.ages
-
-    def restore(self, memory: tuple[NDArray[np.uint8], NDArray[np.uint8]]) -> None:
-        """Continues from the values and ages of `memory`."""
-        self._values, self.ages = memory
-
     def fading(self, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Returns the strength of each observed value, shape (n, H, W, n_observations).
 

@@ -11,7 +11,6 @@ from emberwatch.client import wire
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_choice, as_choices
 from emberwatch.envs.base import ONE_ROW, Reward, WorldEnv, check_reward
-from emberwatch.envs.flights import flights_of
 from emberwatch.envs.observations import WINDOW, MovesParts, Observations
 from emberwatch.envs.session import Session, not_reset
 from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
@@ -123,30 +122,13 @@ class WildfireMovesEnv(WorldEnv):
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
-        self._pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
-        super().__init__(Session(settings))
-        self._flights = flights = flights_of(self._spec, 1, pays=reward == "move")
-        self._observations = Observations(observation, self._session, flights, window, kind)
-        self._seen_teams: StepAnswer | None = None
-        self.observation_space = self._observations.space
-        self.action_space = spaces.Discrete(wire.N_MOVES)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode, or with `robot` joins the current episode of the shared world.
-
-        See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
-        """
-        with self._session.turn:
-            answer = self._begin(seed, options)
-            if not self.continues:
-                self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
-                self._begin_path(answer)
-            seen = self._seen(answer)
-            self._session.finish()
-        return seen
+        session = Session(settings)
+        pays = check_reward(reward, "move")
+        parts = Observations(observation, session, kind, window=window, pays=reward == "move")
+        super().__init__(session, parts, spaces.Discrete(wire.N_MOVES), pays=pays)
+        assert parts.flights is not None
+        self._flights = parts.flights
 
     def step(self, action: np.integer[Any] | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one move. Move number T completes the path and moves the world.
@@ -173,40 +155,32 @@ class WildfireMovesEnv(WorldEnv):
 
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Makes a move that does not complete its path."""
-        assert self._answer is not None
         reward = float(self._flights.move(ONE_ROW, move)[0])
-        self._observations.visit(ONE_ROW)
-        observation, info = self._seen(self._answer)
+        observation, info = self._seen()
         return observation, reward, False, False, info
 
     def _complete(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Completes the path with its last move, flies it, and moves the world."""
-        path = self._flights.paths(move)
-        answer = self._session.step(path)
-        before = float(self._flights.paid[0])
-        self._update(self._observations, answer)
-        self._begin_path(answer)
-        if self.render_mode is not None:
-            self._trace(answer, path[0])
-        observation, info = self._seen(answer)
-        reward, terminated, truncated, *_ = answer.numbers(self._pays)
-        return observation, reward - before, terminated, truncated, info
+        paid = float(self._flights.paid[0])
+        outcome = self._fly(self._flights.paths(move))
+        observation, reward, terminated, truncated, info = outcome
+        return observation, reward - paid, terminated, truncated, info
 
-    def _begin_path(self, answer: StepAnswer) -> None:
-        self._answer = answer
-        _, _, _, self._step, self._n_visited, self._start = answer.numbers(self._pays)
-        self._seen_teams = self._teams(self._observations, answer)
+    def _take(self, answer: StepAnswer) -> None:
+        super()._take(answer)
+        self._start = self._numbers[5]
         states = self._session.truth(answer) if self._session.settings.truth else None
         self._flights.start_paths(ONE_ROW, self._start, states)
 
-    def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
-        info = self._describe(answer, self._step, self._n_visited)
+    def _seen(self) -> tuple[Any, dict[str, Any]]:
+        assert self._answer is not None
+        info = self._info()
         info["action_mask"] = self._flights.masks[0]
         if self.render_mode == "human":
             self._draw()
         # Copied, because each move of a path returns the same frame.
-        cells = self._flights.robots
-        return self._observations.one(answer.frames.copy(), cells, self._seen_teams), info
+        frames = self._answer.frames.copy()
+        return self._observations.one(frames, self._flights.robots, self._teams), info
 
     def _draw(self) -> Any:
         made, path = self._flights.made(0), self._path
@@ -247,12 +221,12 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesVectorEnv, world, needs_truth=reward == "move")
         session = vector_session(settings, num_envs)
-        n_rows = session.n_rows
-        self._flights = flights = flights_of(session.spec, n_rows, pays=reward == "move")
-        self._parts = Observations(observation, session, flights, window, kind)
+        parts = Observations(observation, session, kind, window=window, pays=reward == "move")
+        assert parts.flights is not None
+        self._flights = parts.flights
         super().__init__(
             session,
-            self._parts,
+            parts,
             spaces.Discrete(wire.N_MOVES),
             pays=pays,
             max_episode_steps=max_episode_steps,
@@ -273,19 +247,13 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
     ) -> NDArray[np.float64]:
         completed = flown & self._flights.completes()
         if not completed.any():
-            return self._move(actions, flown)
+            return self._flights.move(flown, actions)
         self._exchange(self._flights.paths(actions), completed)
         rewards = self._columns.rewards - self._flights.paid
         others = flown & ~completed
         if others.any():
-            rewards = np.where(others, self._move(actions, others), rewards)
+            rewards = np.where(others, self._flights.move(others, actions), rewards)
         self._begin(completed)
-        return rewards
-
-    def _move(self, actions: NDArray[np.uint8], moved: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Makes a move of the robots `moved`, which completes no path."""
-        rewards = self._flights.move(moved, actions)
-        self._parts.visit(moved)
         return rewards
 
     def _reported(self) -> dict[str, NDArray[Any]]:

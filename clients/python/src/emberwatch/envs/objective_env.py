@@ -7,9 +7,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_choice, as_choices
-from emberwatch.envs.base import ONE_ROW, WorldEnv
+from emberwatch.envs.base import WorldEnv
 from emberwatch.envs.plans import FirstBelief, Plans, PlansOwner
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
@@ -61,9 +60,8 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     * `prior`: the first belief of estimators with a known model: `"simulated"` (the default; its
       first computation takes about a second), `"initial"` or `"uniform"`.
 
-    With `instance`, too, this process computes the beliefs and plans. It publishes its beliefs as
-    `emberwatch-agent` does, and `close` leaves them to the next client of the worlds. If the server
-    hides its model, pass `model` or `checkpoint`.
+    With `instance`, too, this process computes the beliefs and plans. `close` leaves the beliefs to
+    the next client of the worlds. If the server hides its model, pass `model` or `checkpoint`.
 
     ## Vectorized environment
 
@@ -86,55 +84,22 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     ) -> None:
         """See the class."""
         session = Session(Settings.of(WildfireObjectiveEnv, world))
-        super().__init__(session)
-        self._plans = Plans(session, estimator, checkpoint, prior)
-        self.action_space = self._plans.action_space
-        self.observation_space = self._plans.space
+        self._plans = plans = Plans(session, estimator, checkpoint, prior)
+        super().__init__(session, plans, plans.action_space, pays=1)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see `WildfireEnv`."""
-        with self._session.turn:
-            answer = self._begin(seed, options)
-            if not self.continues:
-                self._plans.start_episodes(ONE_ROW, answer.results, answer.frames)
-            seen = self._seen(answer)
-            self._session.finish()
-        return seen
-
-    def step(
-        self, action: np.integer[Any] | int
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies the path that was planned for the chosen objective.
 
         Raises:
             EmberwatchError: As in `WildfireEnv.step`.
         """
-        choice = np.array([as_choice(action, int(self._plans.action_space.n))], np.uint8)
+        choice = np.array([as_choice(action, int(self._plans.action_space.n))])
         with self._session.turn:
-            self._session.begin_step()
-            path = self._plans.paths(choice)
-            answer = self._session.step(path)
-            self._plans.see(ONE_ROW, choice, answer.results, answer.frames)
-            if self.render_mode is not None:
-                self._trace(answer, path[0])
-            observation, info = self._seen(answer)
-            reward, terminated, truncated, *_ = answer.numbers(1)
-            self._session.finish()
-        return observation, reward, terminated, truncated, info
+            return super().step(self._plans.paths(choice))
 
     def close(self) -> None:
         self._plans.close(None if self._answer is None else self._answer.results)
         super().close()
-
-    def _seen(self, answer: StepAnswer) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        self._answer = answer
-        _, _, _, step, n_visited, _ = answer.numbers(1)
-        info = self._describe(answer, step, n_visited)
-        if self.render_mode == "human":
-            self._draw()
-        return self._plans.features[0], info
 
 
 class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
@@ -158,11 +123,11 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
     ) -> None:
         """See the class."""
         session = vector_session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
-        self._plans = Plans(session, estimator, checkpoint, prior)
+        self._plans = plans = Plans(session, estimator, checkpoint, prior)
         super().__init__(
             session,
-            self._plans,
-            self._plans.action_space,
+            plans,
+            plans.action_space,
             pays=1,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
@@ -178,6 +143,4 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
     def _step_worlds(
         self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        self._exchange(self._plans.paths(actions), flown)
-        self._plans.see(flown, actions, self._results, self._frames)
-        return self._columns.rewards.copy()
+        return super()._step_worlds(self._plans.paths(actions), flown)

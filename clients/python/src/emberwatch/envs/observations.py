@@ -8,15 +8,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from emberwatch._native import Flights, Windows
+from emberwatch._native import Flights
 from emberwatch.belief import Belief, kinds, known
 from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
 from emberwatch.common.arguments import as_integer
+from emberwatch.envs.flights import flights_of
 from emberwatch.envs.last_seen import LastSeen
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
-from emberwatch.envs.window import N_OF_BELIEF, N_OF_PATH, of_belief
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 
 Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
@@ -32,6 +32,13 @@ WINDOW: Final = 15
 #: Maximum side of the parts `local` and `recent`, in cells.
 MAX_WINDOW: Final = 255
 
+#: Number of channels of `local` that come from the belief.
+N_OF_BELIEF: Final = 2
+
+#: Number of the last channels of `local` and `recent`: visited cells, cells off the grid or no-fly,
+#: share of the moves that remain.
+N_OF_PATH: Final = 3
+
 #: Parts that need a filter, parts that need a memory of frames, and parts about other robots.
 OF_BELIEF: Final = frozenset(("belief", "local"))
 _OF_MEMORY: Final = frozenset(("age", "recent"))
@@ -45,22 +52,24 @@ class Observations:
         self,
         parts: str | Sequence[str],
         session: Session,
-        flights: Flights | None = None,
-        window: int = WINDOW,
         kind: str = "known",
+        *,
+        window: int | None = None,
+        pays: bool = False,
     ) -> None:
         """Checks the parts and makes their spaces.
 
-        With `flights`, the parts about an incomplete path are available.
+        With `window`, robots fly move by move, and the parts about an incomplete path are
+        available. `pays`: whether moves are rewarded.
         """
         spec, n_rows = session.spec, session.n_rows
-        known = _spaces(spec, None if flights is None else window)
+        known = _spaces(spec, window)
         names = names_of(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
             raise invalid("observation", f"one or several of {', '.join(known)}", repr_of(parts))
         self._names, self._is_plain = names, isinstance(parts, str)
         self._session, self._spec = session, spec
-        self._n_rows, self._flights = n_rows, flights
+        self._n_rows = n_rows
         #: The index of the first row's robot in its world.
         self._first = session.settings.robot or 0
         #: Whether a part is about other robots.
@@ -84,13 +93,15 @@ class Observations:
         self._last_seen = LastSeen(n_rows, *grid) if _OF_MEMORY & set(names) else None
         self._belief: Belief | None = None
         channels = {"local": N_OF_BELIEF, "recent": spec.n_observations}
-        self._windows = {
-            name: Windows(n_rows, spec.height, spec.width, window, channels[name], spec.airspace)
-            for name in names
-            if name in channels
-        }
-        #: Whether the last frame alone determines the observation.
-        self._has_no_memory = not has_memory(names)
+        #: The parts that `flights` shows around the robots, in its order.
+        self._windows = [name for name in names if name in channels]
+        #: The paths of robots that fly move by move.
+        self.flights: Flights | None = None
+        if window is not None:
+            windows = [(window, channels[name]) for name in self._windows]
+            self.flights = flights_of(spec, n_rows, windows, pays=pays)
+        #: Whether observations depend on frames before the last one.
+        self.has_memory = has_memory(names)
         self._image = np.empty(0, np.uint8)
         # One row for each observed value, and a last row for unobserved cells.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
@@ -108,19 +119,21 @@ class Observations:
         have an entry for every row.
         """
         steps = results["world"]["step"]
-        joined = begun & (steps > 0) & (not self._has_no_memory)
+        joined = begun & (steps > 0) & self.has_memory
         self._reset(begun & ~joined, frames)
         rows = np.flatnonzero(joined).tolist()
         each = [self._until(int(steps[row]), row, frames) for row in rows]
-        show, seen = self._reset, np.zeros_like(frames)
+        seen = np.zeros_like(frames)
         # The rows join together, because each update takes the time of all rows.
-        for shown in zip_longest(*each):
+        for number, shown in enumerate(zip_longest(*each)):
             moved = np.zeros(self._n_rows, np.bool_)
             for row, frame in zip(rows, shown, strict=True):
                 if frame is not None:
                     seen[row], moved[row] = frame, True
-            show(moved, seen)
-            show = self.update
+            if number == 0:
+                self._reset(moved, seen)
+            else:
+                self.update(moved, results, seen)
 
     def _until(self, step: int, row: int, frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
         """Yields the frames of a row that are still kept, then its frame of the step."""
@@ -141,10 +154,10 @@ class Observations:
             self._belief.predict(begun)
         self._show(begun)
 
-    def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+    def update(
+        self, moved: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
+    ) -> None:
         """Updates the rows `moved` with a step; `frames` has a frame for every row."""
-        if self._has_no_memory:
-            return
         if self._last_seen is not None:
             self._last_seen.update(moved, frames)
         if self._belief is not None:
@@ -160,33 +173,24 @@ class Observations:
 
     def memory(self) -> dict[str, Any]:
         """Returns what the observations depend on, apart from the last frames."""
-        flights = self._flights
+        flights = self.flights
         return {
             "belief": self._belief,
-            "last_seen": None if self._last_seen is None else self._last_seen.memory(),
+            "last_seen": self._last_seen,
             "moves": [] if flights is None else [flights.made(row) for row in range(self._n_rows)],
         }
 
-    def restore(self, memory: dict[str, Any]) -> None:
+    def restore(self, memory: dict[str, Any], results: NDArray[np.void]) -> None:
         """Continues from `memory`; the environment has begun the paths of all robots again."""
-        self._belief = memory["belief"]
-        if self._last_seen is not None:
-            self._last_seen.restore(memory["last_seen"])
+        self._belief, self._last_seen = memory["belief"], memory["last_seen"]
         self._show(np.ones(self._n_rows, np.bool_))
         # The moves of the incomplete paths are made again.
         made: list[NDArray[np.uint8]] = memory["moves"]
         for index in range(max(map(len, made), default=0)):
             moved = np.array([len(moves) > index for moves in made])
             actions = [int(moves[index]) if len(moves) > index else 0 for moves in made]
-            if self._flights is not None:
-                self._flights.move(moved, np.array(actions, np.uint8))
-                self.visit(moved)
-
-    def visit(self, moved: NDArray[np.bool_]) -> None:
-        """Updates the rows `moved` with a move that did not complete its path."""
-        if self._flights is not None:
-            for windows in self._windows.values():
-                windows.visit(self._flights, moved)
+            if self.flights is not None:
+                self.flights.move(moved, np.array(actions, np.uint8))
 
     def all(
         self,
@@ -244,14 +248,14 @@ class Observations:
             return self._last_seen.ages[..., np.newaxis].copy()
         if name == "belief":
             return self._image.copy()
-        assert self._flights is not None
+        assert self.flights is not None
         if name in self._windows:
-            return self._windows[name].around(self._flights)
+            return self.flights.around(self._windows.index(name))
         if name == "visited":
-            return self._flights.visited[..., np.newaxis]
+            return self.flights.visited[..., np.newaxis]
         if name == "action_mask":
-            return self._flights.masks
-        return self._flights.n_made
+            return self.flights.masks
+        return self.flights.n_made
 
     def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Returns 255 in the cells of each row's teammates; `robots` includes all robots."""
@@ -276,11 +280,24 @@ class Observations:
         if self._belief is not None and "belief" in self._names:
             image = np.rint(255.0 * self._belief.belief.transpose(1, 2, 3, 0))
             self._image = image.astype(np.uint8)
-        for name, windows in self._windows.items():
+        for index, name in enumerate(self._windows):
+            assert self.flights is not None
             if name == "recent" and self._last_seen is not None:
-                windows.start_paths(rows, self._last_seen.fading(rows))
+                self.flights.show(index, rows, self._last_seen.fading(rows))
             elif self._belief is not None:
-                windows.start_paths(rows, of_belief(self._belief, rows))
+                self.flights.show(index, rows, _local(self._belief, rows))
+
+
+def _local(belief: Belief, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Returns the first channels of `local` for the rows `rows`, shape (n, H, W, 2).
+
+    These are 255 times the probability of the state that pays most, and 255 times the entropy
+    divided by log S.
+    """
+    target = belief.belief[belief.target_state]
+    entropy = belief.entropy() / np.log(len(belief.state_names))
+    channels = np.stack((target[rows], entropy[rows]), axis=-1)
+    return np.rint(255.0 * channels).astype(np.uint8)
 
 
 def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:

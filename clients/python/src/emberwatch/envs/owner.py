@@ -10,6 +10,8 @@ from emberwatch.client.client import Lease
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_json
 from emberwatch.common.paths import with_absolute_paths
+from emberwatch.envs.observations import Observations
+from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.envs.state import EnvState
@@ -21,6 +23,7 @@ class SessionOwner:
     """The public attributes of an environment or vector environment, taken from its session."""
 
     _session: Session
+    _observations: Observations | Plans
     _made_by: EnvSpec | None = None
 
     @property
@@ -92,8 +95,7 @@ class SessionOwner:
         keep their own memory, such as the number of steps in Gymnasium's `TimeLimit`.
 
         Raises:
-            InvalidArgumentError: If the worlds are on a server (then see `Client.snapshot`), or the
-                environment plans (`WildfireObjective`).
+            InvalidArgumentError: If the worlds are on a server (then see `Client.snapshot`).
             EmberwatchError: Code ``"closed"`` before the first reset, code ``"interrupted"`` if an
                 earlier step or reset did not finish.
         """
@@ -124,7 +126,7 @@ class SessionOwner:
 
     def _form(self) -> str:
         """Names the class and what it observes."""
-        raise NotImplementedError
+        return f"{type(self).__name__} with {self._observations.form}"
 
     def _memory(self) -> dict[str, Any]:
         """Returns what the future depends on, apart from the worlds."""

@@ -80,7 +80,6 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             autoreset_mode=AutoresetMode.DISABLED,
             **keywords,
         )
-        self._worlds.keeps_frames = True
         self._observes_masks = "action_mask" in names_of(keywords["observation"])
         self.possible_agents = [f"robot_{row}" for row in range(self._worlds.num_envs)]
         self.agents: list[str] = []
@@ -204,7 +203,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         return slice(0, len(self.possible_agents))
 
     def _by_agent(self, seen: Any) -> dict[str, Any]:
-        return {agent: of_row(seen, row) for row, agent in enumerate(self.possible_agents)}
+        # Copies, because `state` shows the original frames.
+        rows = enumerate(self.possible_agents)
+        return {agent: deepcopy(of_row(seen, row)) for row, agent in rows}
 
     def _infos(self, infos: dict[str, Any]) -> dict[str, dict[str, Any]]:
         if self._observes_masks:

@@ -1,17 +1,12 @@
 """`emberwatch/Wildfire-v0`: one step flies one path."""
 
-from typing import Any, Unpack
+from typing import Unpack
 
-import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
-from emberwatch._native import moves
 from emberwatch.client import wire
-from emberwatch.client.wire import StepAnswer
-from emberwatch.common.arguments import as_moves
-from emberwatch.envs.base import ONE_ROW, Reward, WorldEnv, check_reward
+from emberwatch.envs.base import Reward, WorldEnv, check_reward
 from emberwatch.envs.observations import Observations, Parts, has_memory
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
@@ -163,67 +158,9 @@ class WildfireEnv(WorldEnv):
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
-        settings = Settings.of(WildfireEnv, world)
-        self._pays = check_reward(reward)
-        super().__init__(Session(settings))
-        self._observations = Observations(observation, self._session, kind=kind)
-        self.observation_space = self._observations.space
-        self.action_space = spaces.MultiDiscrete([wire.N_MOVES] * self._spec.n_moves)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode, or with `robot` joins the current episode of the shared world.
-
-        See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
-        """
-        with self._session.turn:
-            answer = self._begin(seed, options)
-            self._answer = answer
-            if not self.continues:
-                self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
-            _, _, _, step, n_visited, cells = answer.numbers(self._pays)
-            seen = self._seen(answer, step, n_visited, cells)
-            self._session.finish()
-        return seen
-
-    def step(
-        self, action: NDArray[np.integer[Any]]
-    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Flies a path of T moves.
-
-        Raises:
-            InvalidArgumentError: If the action is not `(T,)` integers of 0 to 3. Nothing is sent.
-            LeaseLostError: If another client took over the world.
-            ServerGoneError: If the server has ended. The next reset attaches to a new server of
-                the same instance.
-            RequestTimeoutError: If the server does not answer. The world may have moved: reset or
-                resume.
-            EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
-                for example after Ctrl-C: reset or resume. Nothing is sent.
-        """
-        session = self._session
-        with session.turn:
-            session.begin_step()
-            self._answer = answer = session.step(action)
-            self._update(self._observations, answer)
-            reward, terminated, truncated, step, n_visited, cells = answer.numbers(self._pays)
-            if self.render_mode is not None:
-                self._trace(answer, as_moves(action, 1, self._spec.n_moves).reshape(-1))
-            observation, info = self._seen(answer, step, n_visited, cells)
-            session.finish()
-        return observation, reward, terminated, truncated, info
-
-    def _seen(
-        self, answer: StepAnswer, step: int, n_visited: int, cells: NDArray[np.int64]
-    ) -> tuple[Any, dict[str, Any]]:
-        info = self._describe(answer, step, n_visited)
-        # The learner may write to its frame, so pictures are drawn from another copy.
-        frames = answer.frames if self.render_mode is None else answer.frames.copy()
-        if self.render_mode == "human":
-            self._draw()
-        teams = self._teams(self._observations, answer)
-        return self._observations.one(frames, cells, teams), info
+        session = Session(Settings.of(WildfireEnv, world))
+        parts = Observations(observation, session, kind=kind)
+        super().__init__(session, parts, _paths(session), pays=check_reward(reward))
 
 
 class WildfireVectorEnv(WorldVectorEnv):
@@ -263,19 +200,13 @@ class WildfireVectorEnv(WorldVectorEnv):
         super().__init__(
             session,
             Observations(observation, session, kind=kind),
-            spaces.MultiDiscrete([wire.N_MOVES] * session.spec.n_moves),
+            _paths(session),
             pays=pays,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
 
-    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
-        n_moves = self._spec.n_moves
-        chosen = moves(actions, self.num_envs, n_moves)
-        return as_moves(actions, self.num_envs, n_moves) if chosen is None else chosen
 
-    def _step_worlds(
-        self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
-        self._exchange(actions, flown)
-        return self._columns.rewards.copy()
+def _paths(session: Session) -> spaces.MultiDiscrete:
+    """Returns the action space of one robot."""
+    return spaces.MultiDiscrete([wire.N_MOVES] * session.spec.n_moves)

@@ -8,11 +8,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 import emberwatch._native as _native
-from emberwatch.client.wire import RobotResult, StepResult, WorldResult
+from emberwatch.client.wire import RobotResult, StepAnswer, StepResult, WorldResult
 from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
-from emberwatch.envs.state import EnvState
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
@@ -40,16 +39,6 @@ class Plans:
             raise InvalidArgumentError(
                 "robots, robot: expected worlds of one robot, as options are planned for one robot"
             )
-        given: dict[str, object] = {
-            "estimator": estimator,
-            "prior": prior,
-            "checkpoint": checkpoint,
-        }
-        for name, value in given.items():
-            kinds = (str, PathLike) if name == "checkpoint" else str
-            if not isinstance(value, kinds) and (name == "prior" or value is not None):
-                expected = "a path" if name == "checkpoint" else "a name"
-                raise invalid(name, expected, repr_of(value))
         self._session = session
         path = None if checkpoint is None else utf8("checkpoint", checkpoint)
         # The bytes, because the file may change or move before a reset makes the beliefs again.
@@ -62,9 +51,10 @@ class Plans:
         #: Name of the estimator that computes the beliefs.
         self.estimator: Final = self._made().estimator
         self._native: _native.Options | None = None
-        #: The instance in which beliefs are published, and its number for world 0; None: they are
-        #: not published.
-        self._watched: tuple[str, int] | None = None
+        #: As in `Observations`.
+        self.has_memory: Final = True
+        self.shows_team: Final = False
+        self.form: Final = f"estimator={self.estimator!r}, prior={prior!r}, checkpoint={path!r}"
         #: Features of all worlds' plans; a new array after each step.
         self.features = np.zeros((session.n_worlds, *shape), np.float32)
         self._paths = np.zeros((session.n_worlds, len(OBJECTIVES), 0), np.uint8)
@@ -78,45 +68,56 @@ class Plans:
         left one, the belief is computed from the frames that the server keeps. `results` and
         `frames` have a row for every world.
         """
-        settings = self._session.settings
-        watched = None if settings.instance is None else (settings.instance, settings.world)
-        native = self._native
-        if native is None or watched != self._watched:
-            self._native = native = self._made(watched)
-            self._watched = watched
-        worlds = np.flatnonzero(begun).tolist()
-        native.start_episodes(worlds, results["world"]["seed"][begun].tolist())
-        known = [world for world in worlds if self._resumes(native, world, results[world])]
-        if known:
-            chosen = results[known].view(np.uint8)
-            self.features, self._paths = native.plan(known, chosen, None, None)
+        native = self._native = self._native or self._made()
+        native.start_episodes(begun, results.view(np.uint8))
         new = begun.copy()
-        new[known] = False
-        self._plan(new, results, frames)
+        for world in np.flatnonzero(begun).tolist():
+            new[world] = not self._resumes(native, world, results[world])
+        native.update(new, results.view(np.uint8), frames)
+        self._plan(begun, results)
 
     def paths(self, choices: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Returns the path of each world's chosen option, `(n_worlds, T)`."""
         return self._paths[np.arange(len(choices)), choices]
 
-    def see(
-        self,
-        moved: NDArray[np.bool_],
-        choices: NDArray[np.uint8],
-        results: NDArray[np.void],
-        frames: NDArray[np.uint8],
+    def update(
+        self, moved: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
     ) -> None:
         """Updates the beliefs about the worlds in `moved` with a step, and plans again there.
 
-        All arrays have a row for every world; `choices` are the options that were flown.
+        `results` and `frames` have a row for every world.
         """
-        self._plan(moved, results, frames, choices)
-
-    def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Does nothing: `see` does the work, as it also needs the results."""
+        assert self._native is not None
+        self._native.update(moved, results.view(np.uint8), frames)
+        self._plan(moved, results)
 
     def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
         """Returns the observations of all worlds, stacked."""
         return self.features
+
+    def one(
+        self, frames: NDArray[np.uint8], robots: NDArray[np.int64], teams: StepAnswer | None
+    ) -> NDArray[np.float32]:
+        """Returns the observation of the only world."""
+        return self.features[0]
+
+    def memory(self) -> list[tuple[str, bytes] | None]:
+        """Returns the beliefs about all worlds, and what else their plans depend on."""
+        native = self._native
+        assert native is not None
+        return [native.left(world) for world in range(self._session.n_worlds)]
+
+    def restore(self, memory: list[tuple[str, bytes] | None], results: NDArray[np.void]) -> None:
+        """Continues from `memory`, and plans again; `results` has a row for every world."""
+        native = self._native
+        assert native is not None
+        every = np.ones(len(memory), np.bool_)
+        native.start_episodes(every, results.view(np.uint8))
+        for world, left in enumerate(memory):
+            if left is None or not native.take_over(world, *left):
+                expected = f"a state of the estimator {self.estimator!r}"
+                raise invalid("restore_state", expected, "another")
+        self._plan(every, results)
 
     def close(self, results: NDArray[np.void] | None) -> None:
         """Leaves the beliefs about a running server's worlds to their next client."""
@@ -142,25 +143,9 @@ class Plans:
             except EmberwatchError:
                 return  # the server ended or keeps no beliefs: the next client uses past frames
 
-    def _plan(
-        self,
-        worlds: NDArray[np.bool_],
-        results: NDArray[np.void],
-        frames: NDArray[np.uint8],
-        flown: NDArray[np.uint8] | None = None,
-    ) -> None:
+    def _plan(self, worlds: NDArray[np.bool_], results: NDArray[np.void]) -> None:
         assert self._native is not None
-        if not worlds.any():
-            return
-        if not worlds.all():
-            results, frames = results[worlds], frames[worlds]
-            flown = None if flown is None else flown[worlds]
-        self.features, self._paths = self._native.plan(
-            np.flatnonzero(worlds).tolist(),
-            results.view(np.uint8),
-            frames,
-            None if flown is None else flown.tolist(),
-        )
+        self.features, self._paths = self._native.plan(worlds, results.view(np.uint8))
 
     def _resumes(self, native: _native.Options, world: int, result: np.void) -> bool:
         """Restores the belief of a world; returns whether it includes the current step."""
@@ -171,30 +156,17 @@ class Plans:
         if left is not None and native.take_over(world, left.kind, left.data):
             return True
         for past in self._session.history(world, step):
-            native.see([world], past.results.view(np.uint8), past.frames)
+            native.recall(world, past.results.view(np.uint8), past.frames)
         return False
 
-    def _made(self, watched: tuple[str, int] | None = None) -> _native.Options:
-        session = self._session
-        return _native.Options(session.spec, session.n_worlds, *self._arguments, watched)
+    def _made(self) -> _native.Options:
+        return _native.Options(self._session.spec, self._session.n_worlds, *self._arguments)
 
 
 class PlansOwner:
     """The public attributes of environments whose actions choose a plan."""
 
     _plans: Plans
-
-    def clone_state(self) -> EnvState:
-        """Refused: the plans of this environment cannot be copied."""
-        raise self._no_state("clone_state")
-
-    def restore_state(self, state: EnvState) -> None:
-        """Refused: the plans of this environment cannot be copied."""
-        raise self._no_state("restore_state")
-
-    def _no_state(self, call: str) -> InvalidArgumentError:
-        expected = "an environment of paths or moves, as plans cannot be copied"
-        return invalid(call, expected, type(self).__name__)
 
     @property
     def objectives(self) -> tuple[str, ...]:

@@ -106,11 +106,10 @@ class Session:
             with self._connect(settings.instance) as client:
                 self.spec, self._robots = running_spec(settings, n_rows, client.info)
         self.n_rows: Final = len(self._robots)
-        n_worlds = self.spec.shape.n_worlds(self._robots.start, self.n_rows)
-        self.n_worlds: Final = n_worlds
-        self._worlds: Final = range(settings.world, settings.world + n_worlds)
-        if settings.truth and settings.instance and n_worlds > wire.TRUTH_BUFFER:
-            raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", n_worlds)
+        self.n_worlds: Final = max(1, self.n_rows // self.spec.n_robots)
+        self._worlds: Final = range(settings.world, settings.world + self.n_worlds)
+        if settings.truth and settings.instance and self.n_worlds > wire.TRUTH_BUFFER:
+            raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", self.n_worlds)
         warn_without_rewards(self.spec)
 
     @property
@@ -236,12 +235,12 @@ class Session:
     def teams(self, answer: StepAnswer) -> StepAnswer:
         """Returns the results of all robots in the answer's world, and the team's frame."""
         # Recalls the answer's step, because other clients may have moved the world since then.
-        shape, client = self.spec.shape, self._client
+        n_robots, client = self.spec.n_robots, self._client
         if client is None:
             raise not_reset()
-        first = answer.first_robot // shape.n_robots * shape.n_robots
+        first = answer.first_robot // n_robots * n_robots
         step = int(answer.worlds["step"][0])
-        return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
+        return client.recall(step, first, n_robots, team=True, timeout=self.settings.timeout)
 
     def left_belief(self, row: int) -> LeftBelief | None:
         """Returns the belief that an agent left for a robot's current step."""

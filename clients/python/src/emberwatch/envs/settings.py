@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -17,8 +16,7 @@ import numpy as np
 import emberwatch._native as _native
 from emberwatch.client.client import STEP_TIMEOUT
 from emberwatch.client.replies import ServerInfo
-from emberwatch.client.wire import Shape
-from emberwatch.common.arguments import as_count, read_settings
+from emberwatch.common.arguments import read_settings
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 from emberwatch.model import Description, Model
 from emberwatch.model.airspace import Airspace
@@ -28,7 +26,7 @@ from emberwatch.model.tasks import Task, built_in_tasks
 #: section 2).
 SEEDS: Final = 2**53
 
-#: Maps names of settings, as in error messages, to the keywords whose names differ.
+#: The keywords whose names differ from those of settings in `config/server.toml`, and in errors.
 _KEYWORDS: Final = {
     "moves": "n_moves",
     "worlds": "num_envs",
@@ -36,19 +34,11 @@ _KEYWORDS: Final = {
     "cells times robots": "height times width times robots",
 }
 
-#: Hints about keywords that were removed.
-_REMOVED: Final = {
-    "backend": " (removed: worlds are simulated in this process; instance=... attaches to a server)"
-}
-
 _Init = TypeVar("_Init")
 
 
 class WorldArguments(TypedDict, total=False):
-    """The shared keywords and their types.
-
-    Tests compare them with the settings of worlds that the native module declares.
-    """
+    """The shared keywords and their types."""
 
     instance: str | None
     world: int
@@ -73,11 +63,6 @@ class WorldArguments(TypedDict, total=False):
 
 _KINDS: Final[dict[str, Any]] = get_type_hints(WorldArguments)
 
-#: The settings of worlds by keyword: their names in `config/server.toml`, and ranges of numbers.
-_OF_WORLDS: Final = {
-    _KEYWORDS.get(name, name): (name, limits) for name, limits in _native.world_settings().items()
-}
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
@@ -96,9 +81,9 @@ class Settings:
     #: Whether infos and pictures show the hidden states. Even if False, `truth` may be set, for
     #: rewards that need the hidden states.
     reveals: bool = False
-    #: The other keywords, which are settings of worlds, by their names in `config/server.toml`.
-    #: A keyword that is None is left out: the default, or the server's value.
-    worlds: dict[str, object]
+    #: The other keywords, which are settings of worlds. One that is None is left out: the default,
+    #: or the server's value.
+    worlds: dict[str, Any]
 
     @classmethod
     def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
@@ -107,44 +92,41 @@ class Settings:
         Raises:
             TypeError: If a keyword is unknown. The message names the most similar keyword, and all
                 known ones.
-            InvalidArgumentError: If a value has the wrong type, or a number is out of range.
+            InvalidArgumentError: If a value has the wrong type.
         """
         parameters = signature(environment).parameters.values()
         known = {each.name for each in parameters if each.kind is each.KEYWORD_ONLY}
-        own: dict[str, Any] = {}
-        worlds: dict[str, object] = {}
-        for keyword, value in world.items():
-            if keyword not in known:
-                alike = get_close_matches(keyword, known, 1)
-                hint = f" (did you mean {alike[0]!r}?)" if alike else ""
-                hint = _REMOVED.get(keyword, hint)
-                # This is Python's own message, which TorchRL parses to find a keyword to leave out.
-                raise TypeError(
-                    f"{environment.__name__}() got an unexpected keyword argument "
-                    f"{repr_of(keyword)}{hint}; known keywords: {', '.join(sorted(known))}"
-                )
-            name, limits = _OF_WORLDS.get(keyword, (None, None))
-            value = _checked(keyword, value, limits)
-            if name is None:
-                own[keyword] = value
-            elif value is not None:
-                worlds[name] = value
+        for keyword in world.keys() - known:
+            alike = get_close_matches(keyword, known, 1)
+            hint = f" (did you mean {alike[0]!r}?)" if alike else ""
+            # This is Python's own message, which TorchRL parses to find a keyword to leave out.
+            raise TypeError(
+                f"{environment.__name__}() got an unexpected keyword argument "
+                f"{repr_of(keyword)}{hint}; known keywords: {', '.join(sorted(known))}"
+            )
+        given = {keyword: _checked(keyword, value) for keyword, value in world.items()}
+        names = {each.name for each in fields(cls)}
+        own = {keyword: value for keyword, value in given.items() if keyword in names}
         if not own.get("timeout", STEP_TIMEOUT) > 0:
             raise invalid("timeout", "seconds above 0", own["timeout"])
         reveals = own.pop("truth", False)
-        return cls(**own, truth=reveals or needs_truth, reveals=reveals, worlds=worlds)
+        rest = {
+            keyword: value
+            for keyword, value in given.items()
+            if keyword not in names and value is not None
+        }
+        return cls(**own, truth=reveals or needs_truth, reveals=reveals, worlds=rest)
 
     def read(self) -> _native.CheckedSettings:
         """Checks the settings of one world, and reads their files. Errors name keywords."""
+        worlds = {"moves" if name == "n_moves" else name: it for name, it in self.worlds.items()}
+        own = {"task": self.task, "publish_truth": self.truth, "history": self.history}
         with _names_keywords():
-            own = {"task": self.task, "publish_truth": self.truth, "history": self.history}
-            return read_settings({**own, **self.worlds})
+            return read_settings({**own, **worlds})
 
 
-def _checked(keyword: str, value: Any, limits: tuple[int, int] | None) -> Any:
-    """Returns a keyword's value as a plain Python object; checks its type and range."""
-    if limits is not None and value is not None:
-        return as_count(value, keyword, *limits)
+def _checked(keyword: str, value: Any) -> Any:
+    """Returns a keyword's value as a plain Python object; checks its type."""
     if isinstance(value, np.generic):
         value = cast("Any", value.item())
     kinds = get_args(_KINDS[keyword]) or (_KINDS[keyword],)
@@ -213,9 +195,25 @@ class WorldSpec:
         """The model or description, for names and rewards of states; None if it is hidden."""
         return self.description or self.model
 
-    @property
-    def shape(self) -> Shape:
-        return Shape(self.n_robots, self.height, self.width)
+    @classmethod
+    def of(cls, info: ServerInfo, task: Task | None) -> WorldSpec:
+        """Returns the spec of the worlds of a server, or of a server with the same settings."""
+        description = info.recorded_states
+        if description is not None:
+            description = description.with_radius(info.airspace.radius)
+        return cls(
+            model=None if info.model is None else Model.from_toml(info.model),
+            height=info.height,
+            width=info.width,
+            n_moves=info.n_moves,
+            n_observations=info.n_observations,
+            burn_in=info.burn_in,
+            airspace=info.airspace,
+            n_robots=info.n_robots,
+            is_recorded=info.recorded_world is not None,
+            description=description,
+            task=task,
+        )
 
 
 def draw_seed(generator: np.random.Generator) -> int:
@@ -238,26 +236,10 @@ def own_spec(
                 "it, the environment simulates its own worlds"
             )
     read = settings.read()
-    checked: dict[str, Any] = json.loads(read.settings)
-    n_robots: int = checked["robots"]
-    robots = _robots(settings, n_rows, n_robots)
+    spec = WorldSpec.of(read.info, Task.of(read))
+    robots = _robots(settings, n_rows, spec.n_robots)
     with _names_keywords():
-        read = read.with_worlds(len(robots) // n_robots)
-    described = _described(read, checked)
-    spec = WorldSpec(
-        model=described if isinstance(described, Model) else None,
-        height=checked["height"],
-        width=checked["width"],
-        n_moves=checked["moves"],
-        n_observations=described.n_observations,
-        burn_in=checked["burn_in"],
-        airspace=described.airspace,
-        n_robots=n_robots,
-        is_recorded=bool(checked["states"]),
-        description=described if checked["states"] else None,
-        task=Task.of(read),
-    )
-    return spec, robots, read
+        return spec, robots, read.with_worlds(len(robots) // spec.n_robots)
 
 
 def running_spec(
@@ -271,16 +253,22 @@ def running_spec(
     task = built_in_tasks().get(info.task or "")
     if settings.task is not None:
         task = _check_task(settings.task, info)
-    served = _served(info) | {"sensor_radius": info.airspace.radius}
-    for name, asked in settings.worlds.items():
-        keyword = _KEYWORDS.get(name, name)
-        if name == "model":
+    served = {
+        "height": info.height,
+        "width": info.width,
+        "n_moves": info.n_moves,
+        "robots": info.n_robots,
+        "burn_in": info.burn_in,
+        "sensor_radius": info.airspace.radius,
+    }
+    for keyword, asked in settings.worlds.items():
+        if keyword == "model":
             if info.model is not None:
                 raise invalid(keyword, "None, as the running server reveals its model", asked)
-        elif name not in served:
+        elif keyword not in served:
             raise invalid(keyword, "None, as the running server determines it", repr_of(asked))
-        elif asked != served[name]:
-            raise invalid(keyword, f"the server's {served[name]}, or None", asked)
+        elif asked != served[keyword]:
+            raise invalid(keyword, f"the server's {served[keyword]}, or None", repr_of(asked))
     robots = _robots(settings, n_rows, info.n_robots)
     first, last = settings.world, (robots.stop - 1) // info.n_robots
     if not 0 <= first <= last < info.n_worlds:
@@ -288,42 +276,14 @@ def running_spec(
         raise invalid("world", f"worlds within 0 to {info.n_worlds - 1}", got)
     if settings.truth and not info.publish_truth:
         raise invalid("truth", "a server started with --publish-truth", "one without")
-    model = None if info.model is None else Model.from_toml(info.model)
+    spec = WorldSpec.of(info, task)
     if "model" in settings.worlds:
-        asked: Any = settings.worlds["model"]
-        model = Model.named(asked).with_radius(info.airspace.radius)
+        model = Model.named(settings.worlds["model"]).with_radius(info.airspace.radius)
         has, got = (info.n_observations, info.airspace), (model.n_observations, model.airspace)
         if has != got:
             raise invalid("model", f"the server's sensor and no-fly cells, {has}", f"{got}")
-    description = info.recorded_states
-    if description is not None:
-        description = description.with_radius(info.airspace.radius)
-    spec = WorldSpec(
-        model=model,
-        height=info.height,
-        width=info.width,
-        n_moves=info.n_moves,
-        n_observations=info.n_observations,
-        burn_in=info.burn_in,
-        airspace=info.airspace,
-        n_robots=info.n_robots,
-        is_recorded=info.recorded_world is not None,
-        description=description,
-        task=task,
-    )
+        spec = replace(spec, model=model)
     return spec, robots
-
-
-def _served(info: ServerInfo) -> dict[str, int]:
-    """Returns the settings of worlds that a running server reports, by name."""
-    return {
-        "height": info.height,
-        "width": info.width,
-        "moves": info.n_moves,
-        "robots": info.n_robots,
-        "burn_in": info.burn_in,
-        "max_steps": info.max_steps,
-    }
 
 
 def _check_task(asked: str | Path, info: ServerInfo) -> Task:
@@ -333,31 +293,13 @@ def _check_task(asked: str | Path, info: ServerInfo) -> Task:
     assert task is not None
     if task.name != info.task:
         raise invalid("task", f"the server's {info.task!r}, or None", repr_of(task.name))
-    own: dict[str, Any] = json.loads(read.settings)
-    for name, served in _served(info).items():
-        if own[name] != served:
-            raise invalid(f"{name} of task {task.name!r}", f"the server's {served}", own[name])
-    described = _described(read, own)
-    if described.sensor_radius != info.airspace.radius:
-        expected = f"the server's {info.airspace.radius}"
-        name = f"sensor_radius of task {task.name!r}"
-        raise invalid(name, expected, described.sensor_radius)
-    shown: Description | None = info.recorded_states
-    if shown is not None:
-        shown = shown.with_radius(info.airspace.radius)
-    elif info.model is not None:
-        shown = Model.from_toml(info.model)
-    if shown not in (None, described):
-        raise invalid(f"states of task {task.name!r}", "the server's states", described.name)
+    if (task.max_steps, read.worlds_fingerprint) != (info.max_steps, info.worlds_fingerprint):
+        raise invalid(
+            f"task {task.name!r}",
+            f"the server's worlds, {info.worlds_fingerprint}, and {info.max_steps} steps",
+            f"{read.worlds_fingerprint} and {task.max_steps}: the server has another file or flags",
+        )
     return task
-
-
-def _described(read: _native.CheckedSettings, checked: dict[str, Any]) -> Description:
-    """Returns the model of settings, or the description of their recorded states."""
-    if not checked["states"]:
-        return Model.from_toml(read.description)
-    described, radius = Description.from_toml(read.description), checked["sensor_radius"]
-    return described.with_radius(radius) if radius >= 0 else described
 
 
 def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from emberwatch._native import columns
 from emberwatch.client.wire import RESULT_DTYPE, StepAnswer
-from emberwatch.common.arguments import as_array, as_integer, as_seed
+from emberwatch.common.arguments import as_array, as_integer, as_moves, as_seed
 from emberwatch.envs.base import (
     NOTHING_TO_DRAW,
     WorldEnv,
@@ -79,7 +79,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._session, self._spec = session, session.spec
         spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
         self._observations = observations
-        self._views = [View(mode, spec) for _ in range(num_envs)]
+        self._view = View(mode, spec)
         self._max_steps = max_episode_steps
         self._reveals = session.settings.reveals
         self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
@@ -105,8 +105,6 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
-        #: Whether learners receive copies of the frames, so that `seen` keeps the originals.
-        self.keeps_frames = False
 
     def reset(
         self,
@@ -198,7 +196,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         robots = [(at[0], at[1]) for at in cells.tolist()]
         paths = [path for path in map(self._path, range(self.num_envs)[rows]) if path is not None]
         truth = self._truths[row] if self._truths is not None and self._reveals else None
-        return self._views[row].draw(frame, robots, paths, truth)
+        return self._view.draw(frame, robots, paths, truth)
 
     def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
         """Returns the combined frame and the cells of some robots of one world, as new arrays."""
@@ -226,17 +224,18 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()
-        for view in self._views:
-            view.close()
+        self._view.close()
 
-    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
-        raise NotImplementedError
+    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[Any]:
+        """Returns checked actions. If all robots fly, the session checks their paths."""
+        if not self._has_ended:
+            return actions
+        return as_moves(actions, self.num_envs, self._spec.n_moves)
 
-    def _step_worlds(
-        self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
+    def _step_worlds(self, actions: NDArray[Any], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Steps the rows `flown`, and returns rewards; the values of other rows are ignored."""
-        raise NotImplementedError
+        self._exchange(actions, flown)
+        return self._columns.rewards
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
         """Is called after episodes in the rows `begun` have begun or have been resumed."""
@@ -251,8 +250,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _form(self) -> str:
         mode, steps = self.autoreset_mode.value, self._max_steps
-        form = f"{self._memorised().form}, max_episode_steps={steps}, autoreset_mode={mode}"
-        return f"{type(self).__name__} with {form}"
+        return f"{super()._form()}, max_episode_steps={steps}, autoreset_mode={mode}"
 
     def _memory(self) -> dict[str, Any]:
         return {
@@ -260,7 +258,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             "over": self._over,
             "generators": self._generators,
             "paths": self._paths,
-            "observations": self._memorised().memory(),
+            "observations": self._observations.memory(),
         }
 
     def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
@@ -269,13 +267,9 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._has_ended = bool(self._over.any())
         self._generators, self._paths = memory["generators"], memory["paths"]
         self._begin(self._every)
-        self._memorised().restore(memory["observations"])
+        self._observations.restore(memory["observations"], self._results)
 
-    def _memorised(self) -> Observations:
-        assert isinstance(self._observations, Observations)  # plans refuse `clone_state`
-        return self._observations
-
-    def _exchange(self, paths: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
+    def _exchange(self, paths: NDArray[Any], moved: NDArray[np.bool_]) -> None:
         """Flies complete paths in the rows `moved`, with one message for each run of rows."""
         if moved is self._every or moved.all():
             self._take(self._session.step(paths))
@@ -284,14 +278,16 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             for run in _runs(moved):
                 self._exchange_run(paths, run)
         self._exchanged = moved
-        self._observations.update(moved, self._frames)
+        if self._observations.has_memory:
+            self._observations.update(moved, self._results, self._frames)
         if self.render_mode is not None:
+            flown = as_moves(paths, self.num_envs, self._spec.n_moves)
             for row in np.flatnonzero(moved).tolist():
                 robot = self._results["robot"][row]
                 start = int(robot["start_row"]), int(robot["start_col"])
-                self._paths[row] = fly(start, paths[row], self._spec)
+                self._paths[row] = fly(start, flown[row], self._spec)
 
-    def _exchange_run(self, paths: NDArray[np.uint8], run: range) -> None:
+    def _exchange_run(self, paths: NDArray[Any], run: range) -> None:
         chosen = slice(run.start, run.stop)
         answer = self._session.step(paths[chosen], run)
         self._frames[chosen], self._results[chosen] = answer.frames, answer.results
@@ -355,17 +351,14 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Returns the outcome of a step, after resets in mode `SAME_STEP`."""
-        terminations, truncations, may_end = self._none, self._none, False
+        terminations, truncations = self._none.copy(), self._none.copy()
         if self._exchanged is not None and self._columns.is_over:
-            terminations = self._exchanged & self._columns.terminated
-            truncations = self._exchanged & self._columns.truncated
-            may_end = True
+            terminations |= self._exchanged & self._columns.terminated
+            truncations |= self._exchanged & self._columns.truncated
         if self._max_steps is not None:
-            truncations = truncations | (flown & (self._elapsed >= self._max_steps))
-            may_end = True
-        terminations, truncations = terminations.copy(), truncations.copy()
-        over = terminations | truncations if may_end else self._none
-        has_ended = may_end and bool(over.any())
+            truncations |= flown & (self._elapsed >= self._max_steps)
+        over = terminations | truncations
+        has_ended = np.count_nonzero(over) > 0
         infos: dict[str, Any] = {}
         if has_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
             infos = self._final(over)
@@ -420,9 +413,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._observations.all(self._shown(), self._robots())
 
     def _shown(self) -> NDArray[np.uint8]:
-        """Returns frames for the learner, copied if pictures or `seen` need the originals."""
-        is_own = self.render_mode is None and not self.keeps_frames
-        return self._frames if is_own else self._frames.copy()
+        """Returns frames for the learner, copied if pictures need the originals."""
+        return self._frames if self.render_mode is None else self._frames.copy()
 
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         """Returns the seed of each world, after checking all before a generator is replaced."""
