@@ -1,15 +1,14 @@
 //! The simulator's own step from any states, for Python's `Model.advance`.
 
 use crate::detached::detached;
-use crate::errors::{check_memory, interrupted, raised};
+use crate::errors::{check_memory, raised};
 use crate::model::{model_of, shape_of};
 use crate::refusal::{invalid, refused};
-use crate::threads::LOOK;
+use crate::threads::signals;
 use emberwatch_model as model;
 use numpy::ndarray::Array3;
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
-use std::time::Instant;
 
 /// The transition of worlds for one model on one grid. Threads can share it.
 #[pyclass(frozen, module = "emberwatch._native")]
@@ -52,16 +51,13 @@ impl Dynamics {
         next.assign(&states);
         let mut dynamics = self.dynamics.clone();
         let finished = detached(py, next.len(), || {
-            let mut looked = Instant::now();
+            let mut interrupts = signals();
             for (mut world, &seed) in next.outer_iter_mut().zip(&seeds) {
                 let mut states = world.to_owned();
                 dynamics.step(seed, step, &mut states);
                 world.assign(&states);
-                if looked.elapsed() >= LOOK {
-                    if interrupted() {
-                        return false;
-                    }
-                    looked = Instant::now();
+                if interrupts() {
+                    return false;
                 }
             }
             true

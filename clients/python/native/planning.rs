@@ -1,24 +1,20 @@
 //! Beam search in many worlds at once.
 
 use crate::airspace::Given;
-use crate::errors::{check_memory, interrupted, raise_of_channel};
+use crate::errors::{check_memory, raised};
 use crate::model::shape_of;
 use crate::refusal::invalid;
+use crate::threads::signals;
 use emberwatch_belief::planning::objective::CellValues;
 use emberwatch_belief::planning::{BeamSearch, PlanningProblem};
-use emberwatch_messages::errors::ChannelError;
 use emberwatch_model::path::path_to_bytes;
 use emberwatch_model::{Airspace, Cell, Shape};
 use numpy::ndarray::{Array2, ArrayView1};
 use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
-use std::time::{Duration, Instant};
 
 /// Maximum memory of a beam, in bytes.
 const MAX_BYTES: usize = 1 << 32;
-
-/// Interval at which a search checks for Ctrl-C.
-const LOOK: Duration = Duration::from_millis(20);
 
 /// Plans a path for each world. `values`, `[n, H, W]`, are finite; `robots` has shape `[n, 2]`; `keys`, `[n]`, break
 /// ties. Python has checked that `n_moves` and `width` are in range.
@@ -45,14 +41,7 @@ pub fn beam_search<'py>(
     check(py, shape, n_moves, (width, width.min(n_paths)))?;
     let mut paths = Array2::zeros((n_worlds, n_moves));
     let mut search = BeamSearch::new(width.min(n_paths));
-    let mut looked = Instant::now();
-    let mut stops = || {
-        let looks = looked.elapsed() >= LOOK;
-        if looks {
-            looked = Instant::now();
-        }
-        looks && interrupted()
-    };
+    let mut interrupts = signals();
     let worlds = values.outer_iter().zip(robots.outer_iter()).zip(keys);
     for (((values, robot), &key), mut path) in worlds.zip(paths.outer_iter_mut()) {
         search.set_key(key);
@@ -72,8 +61,8 @@ pub fn beam_search<'py>(
             seed: 0,
             step: 0,
         };
-        let plan = py.detach(|| search.plan_unless(&problem, &mut stops));
-        let plan = plan.ok_or_else(|| raise_of_channel(py, ChannelError::Interrupted))?;
+        let plan = py.detach(|| search.plan_unless(&problem, &mut interrupts));
+        let plan = plan.ok_or_else(raised)?;
         path.assign(&ArrayView1::from(&path_to_bytes(&plan.moves)));
     }
     Ok(paths.into_pyarray(py))

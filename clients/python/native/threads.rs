@@ -8,7 +8,20 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 /// Time between two checks for signals. Shorter calls are not interrupted.
-pub const LOOK: Duration = Duration::from_millis(50);
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Returns a function for long work on this thread, which runs signal handlers from time to time. It returns whether one
+/// raised an exception.
+pub fn signals() -> impl FnMut() -> bool {
+    let mut looked = Instant::now();
+    move || {
+        let looks = looked.elapsed() >= LOOK;
+        if looks {
+            looked = Instant::now();
+        }
+        looks && interrupted()
+    }
+}
 
 /// A thread pool that belongs to one object. A global pool would be unusable after a fork, which copies no threads.
 #[derive(Default)]
@@ -44,17 +57,10 @@ impl Pool {
         work: impl Fn(T) -> U + Sync,
     ) -> Option<Vec<U>> {
         let Some(threads) = self.threads(is_short) else {
-            let mut looked = Instant::now();
-            let unless_interrupted = |task| {
-                if looked.elapsed() >= LOOK {
-                    looked = Instant::now();
-                    if interrupted() {
-                        return None;
-                    }
-                }
-                Some(work(task))
-            };
-            return tasks.into_iter().map(unless_interrupted).collect();
+            let mut interrupts = signals();
+            let tasks = tasks.into_iter();
+            let unless_interrupted = |task| (!interrupts()).then(|| work(task));
+            return tasks.map(unless_interrupted).collect();
         };
         let results = watched(threads, |is_over| {
             in_parallel(tasks, |task| {
