@@ -115,7 +115,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
     def close(self) -> None:
         self._session.close()
         self._view.close()
-        self._answer = None  # an answer cannot be copied or pickled
+        self._answer = self._teams = None  # answers cannot be copied or pickled
 
     def past_frames(self) -> Iterator[NDArray[np.uint8]]:
         """Yields the robot's frames before the current step, `(H, W)`, from the first that is kept.
