@@ -9,7 +9,7 @@ use crate::saved::{Saved, is_saved};
 use crate::threads::Pool;
 use emberwatch_belief::brier::{accuracy, brier_score, log_loss};
 use emberwatch_belief::estimation::SpatialFilter;
-use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
 use emberwatch_belief::estimation::scoring::score;
 use emberwatch_learning::file::replace_file;
@@ -202,7 +202,7 @@ impl Estimators {
         let mut out = Array3::zeros((worlds.len(), height, width));
         let tasks = worlds.iter_mut().zip(out.outer_iter_mut());
         self.each(py, true, tasks, |(world, mut out)| {
-            out.assign(&world.belief().entropy(EntropyKind::Sum));
+            out.assign(&world.belief().entropy());
         })?;
         Ok(out.into_pyarray(py))
     }

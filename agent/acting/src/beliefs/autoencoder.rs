@@ -9,7 +9,6 @@ use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::correct;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, ObservationModel};
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::Frame;
 use emberwatch_network::{Autoencoder, Dqn, NetworkError};
 use ndarray::Array2;
@@ -47,8 +46,6 @@ pub struct AutoencoderModel {
     pub autoencoder: Autoencoder,
     /// Chooses an objective from the hidden vector (paper section III.E).
     pub dqn: Dqn,
-    /// The belief that paths were planned on while the DQN was trained.
-    pub basis: BasisKind,
     /// The state with the highest reward.
     pub target: usize,
 }

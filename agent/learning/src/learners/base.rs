@@ -113,13 +113,12 @@ impl Worlds {
     ) -> ActingAgent {
         let setup = Setup {
             airspace: self.airspace.clone(),
-            basis: config.objective.belief,
             beam_width: config.decisions.beam_width,
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),
             target,
-            chooser: Chooser::Objective(policy.objective(target, config)),
+            chooser: Chooser::Objective(policy.objective(target)),
         };
         let agent = Agent::new(estimator, policy, config, setup);
         ActingAgent::new(agent, AgentObservation::new([observation]))

@@ -133,7 +133,7 @@ impl Actor for FilterLearner {
         self.learned = self.fit.learned();
         let (n_walking, tables) = (self.n_walking(), &self.learned.tables);
         let policy = Policy::exploiting(&LEARNED);
-        let objective = policy.objective(self.learned.target, &self.config);
+        let objective = policy.objective(self.learned.target);
         let agents = self.agents.iter_mut().enumerate();
         self.planned = in_parallel(agents, |(index, acting)| {
             let belief = acting.agent.belief().clone();

@@ -201,7 +201,7 @@ impl NetworkLearner {
 impl Actor for NetworkLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let mut decision = self.decide();
-        let objective = self.choices[decision.action].objective(0, &self.config);
+        let objective = self.choices[decision.action].objective(0);
         let acting = self.at_world_mut();
         let (cells, step) = (acting.cells(), acting.step());
         decision.path = acting

@@ -158,7 +158,7 @@ impl NeuralLearner {
 impl Actor for NeuralLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let (target, first) = (self.paying(), self.worlds.numbers.start);
-        let objective = Policy::exploiting(&BELIEF).objective(target, &self.config);
+        let objective = Policy::exploiting(&BELIEF).objective(target);
         let is_exploring = self.progress() < self.config.neural.explore_share;
         let (seed, step) = (self.config.seed, self.world_steps);
         let mut runs = std::mem::take(&mut self.runs);
@@ -169,7 +169,7 @@ impl Actor for NeuralLearner {
             let behaviour =
                 Behaviour::next(run.behaviour, is_exploring, self.worlds.shape(), &mut rng);
             let seen = || self.replay.present(first + index as u32);
-            let (airspace, belief) = (&self.worlds.airspace, agent.basis_belief());
+            let (airspace, belief) = (&self.worlds.airspace, agent.belief());
             let plans = match behaviour.values(objective, airspace, target, belief, seen, &mut rng)
             {
                 Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),

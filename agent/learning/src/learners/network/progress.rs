@@ -7,7 +7,6 @@ use emberwatch_acting::beliefs::WorldForm;
 use emberwatch_acting::beliefs::autoencoder::AutoencoderModel;
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::policy::network_choices;
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::{MAX_VALUES, Shape};
 use emberwatch_network::{Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape};
 use serde::{Deserialize, Serialize};
@@ -17,8 +16,6 @@ use serde::{Deserialize, Serialize};
 pub struct Progress {
     pub autoencoder: Autoencoder,
     pub dqn: Dqn,
-    /// The belief that paths are planned on while the DQN learns.
-    pub basis: BasisKind,
     pub reward: RewardEstimate,
     pub iterations: u64,
 }
@@ -51,7 +48,6 @@ impl Progress {
         Ok(Self {
             autoencoder: Autoencoder::new(settings, shape, config.seed, device)?,
             dqn: Dqn::new(config.dqn.settings(), actions, config.seed),
-            basis: config.objective.belief,
             reward: RewardEstimate::new(n_states),
             iterations: 0,
         })
@@ -103,7 +99,6 @@ impl Progress {
             target: self.target(),
             autoencoder: self.autoencoder,
             dqn: self.dqn,
-            basis: self.basis,
         }
     }
 

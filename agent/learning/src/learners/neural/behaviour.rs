@@ -1,6 +1,6 @@
 //! Behaviours of robots while a belief is learned. A behaviour assigns values to cells, and lasts for several steps.
 
-use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::{CellValues, Objective};
 use emberwatch_model::{Airspace, Grid, Shape};
 use emberwatch_network::Sightings;
@@ -97,7 +97,7 @@ impl Behaviour {
                 let mut values = objective.values_in(belief, airspace);
                 if entropy > 0 {
                     let weight = f32::from(entropy) / 10.0;
-                    values.add_in_sight(weight, &belief.entropy(EntropyKind::Sum));
+                    values.add_in_sight(weight, &belief.entropy());
                 }
                 Some(values)
             }
