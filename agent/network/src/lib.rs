@@ -9,8 +9,7 @@
 //! gradients. Encoder, recurrence, decoder and U-Net each have two implementations: our operators with hand-written
 //! kernels and gradients (`ops`), and candle's stock operators, which also run on GPUs.
 //!
-//! To add a layer, create it in `Network::new` and call it in `Network::forward`. `examples/second_gru.rs` shows how to
-//! add a layer outside this crate.
+//! To add a layer, create it in `Network::new` and call it in `Network::forward`.
 
 mod adam;
 mod autoencoder;
@@ -41,7 +40,7 @@ pub use adam::{Adam, AdamSettings};
 pub use autoencoder::{Autoencoder, AutoencoderSettings};
 pub use candle_core::{Device, utils::barrier_pool};
 pub use decoder::Decoder;
-pub use device::{DeviceError, DeviceKind};
+pub use device::{DEVICES, open_device};
 pub use dqn::{Dqn, DqnSettings, DqnShape, Track, Transition};
 pub use dropout::{Dropout, Mask};
 pub use encoder::Encoder;
