@@ -288,33 +288,6 @@ def test_checkpoints_that_do_not_fit_are_refused(checkpoints: Path, tmp_path: Pa
             belief.load(checkpoints / name, **GRID, model=model)
 
 
-def test_a_neural_belief_can_use_a_known_sensor(checkpoints: Path) -> None:
-    def neural(**keywords: Any) -> Belief:
-        return belief.load(checkpoints / "neural_belief", **GRID, **keywords)
-
-    plain, noisy = neural(), neural(kind="neural+sensor", model=MODEL)
-    shows = MODEL.observation_matrix.T
-    # Beliefs may differ where inverting the sensor gives a negative probability, clamped to 0.
-    possible = (noisy.belief > 1e-5).all(0)
-    shown = np.tensordot(shows, noisy.belief, 1)
-    assert possible.any() and np.allclose(shown[:, possible], plain.belief[:, possible], atol=1e-4)
-    before = noisy.belief[:, 3, 4]
-    frame = np.full((16, 16), 255, np.uint8)
-    frame[3, 4] = 2
-    for kept in (plain, noisy):
-        kept.correct(frame)
-    assert plain.belief[:, 3, 4].tolist() == [0, 0, 1]
-    posterior = shows[2] * before
-    assert np.allclose(noisy.belief[:, 3, 4], posterior / posterior.sum(), atol=1e-6)
-    with refuses("expected a model, got none|expected one, got none"):
-        neural(kind="neural+sensor")
-    alike = MODEL.toml.replace(
-        str(MODEL.observation_matrix[0].tolist()), str(MODEL.observation_matrix[1].tolist()), 1
-    )
-    with refuses("sensor: expected an invertible observation matrix, got states that look alike"):
-        neural(kind="neural+sensor", model=Model.from_toml(alike))
-
-
 def test_an_impossible_frame_names_its_world() -> None:
     prior = np.zeros((3, 1, 2))
     prior[0] = 1
