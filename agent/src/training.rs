@@ -52,7 +52,7 @@ pub struct TrainSummary {
     pub learning: Duration,
 }
 
-/// Trains until the steps are done, the deadline has passed or `stop` is set. Always saves at the end.
+/// Trains until the steps are done or `stop` is set. Always saves at the end.
 /// `contents` is the result of [`TrainingSpec::check`].
 pub fn train(
     worlds: &mut Worlds,
@@ -157,9 +157,8 @@ impl<'a> TrainingLoop<'a> {
     }
 
     fn act(&mut self, spec: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
-        let is_over = || spec.deadline.is_some_and(|end| Instant::now() >= end);
         let is_done = |steps: u64| spec.steps > 0 && steps >= spec.steps;
-        while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
+        while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) {
             let tick = self.step();
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             let start = Instant::now();
@@ -217,8 +216,10 @@ impl<'a> TrainingLoop<'a> {
     fn warn_of_no_update(&self) {
         let steps = self.summary.steps;
         if steps > 0 && self.learner.n_updates() == self.n_before {
-            let cause = self.learner.lacks(steps);
-            tracing::warn!("nothing was learned in {steps} world steps: {cause}");
+            tracing::warn!(
+                "nothing was learned in {steps} world steps: train for more --steps, on longer episodes, or with \
+                 smaller settings of the learner (batch, window, streams)"
+            );
         }
     }
 

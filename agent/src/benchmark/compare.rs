@@ -20,13 +20,10 @@ use emberwatch_acting::rollout::{
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Plan;
 use emberwatch_belief::planning::team::robot_seed;
+use emberwatch_protocol::Move;
 use emberwatch_protocol::feed::Feed;
-use emberwatch_protocol::{Model, Move};
 use std::ops::Range;
 use std::time::{Duration, Instant};
-
-/// The policy of [`Team::Oracle`].
-const ORACLE: &str = "oracle_beam";
 
 #[derive(Debug, Clone)]
 pub struct Comparison {
@@ -39,8 +36,6 @@ pub struct Comparison {
     pub config: AgentConfig,
     /// Learned models, for policies that use them.
     pub learned: Learned,
-    /// Whether known-model beliefs start from each world's hidden state.
-    pub first_state_known: bool,
 }
 
 #[derive(Debug, Default)]
@@ -64,7 +59,7 @@ pub fn compare(
     warn_of_other_worlds(&comparison.learned, worlds.info());
     let mut results = Results::default();
     let mut feed = worlds.feed(prior.probabilities());
-    let entries = comparison.entries(&worlds.model);
+    let entries = comparison.entries();
     // Before other policies run for hours, refuse any policy that cannot run.
     for (policy, _) in &entries {
         let checked = comparison.check(policy, worlds);
@@ -101,24 +96,18 @@ impl Comparison {
         self.seeds.clone().map(world).collect()
     }
 
-    /// Returns each policy with each kind of team, but the oracle team only once.
-    pub fn entries(&self, model: &Model) -> Vec<(Policy, Team)> {
-        let mut entries = Vec::new();
-        for &team in &self.teams {
-            let oracle = Policy::named(ORACLE, model).expect("invariant: every model has it");
-            match team {
-                Team::Oracle => entries.push((oracle, team)),
-                _ => entries.extend(self.policies.iter().map(|it| (it.clone(), team))),
-            }
-        }
-        entries
+    /// Returns each policy with each kind of team.
+    pub fn entries(&self) -> Vec<(Policy, Team)> {
+        let teams = self.teams.iter();
+        let entries =
+            teams.flat_map(|&team| self.policies.iter().map(move |it| (it.clone(), team)));
+        entries.collect()
     }
 
     /// Checks that a policy can act in the worlds.
     fn check(&self, policy: &Policy, worlds: &mut ComparedWorlds) -> Result<()> {
-        let needs_truth = policy.belief.input == Input::States || self.first_state_known;
         ensure!(
-            worlds.has_truth() || !needs_truth,
+            worlds.has_truth() || policy.belief.input != Input::States,
             "it needs the truth channel: start the server with --publish-truth"
         );
         worlds.check_model(policy)?;
@@ -140,15 +129,10 @@ impl Comparison {
         let mut agents = Vec::new();
         for (index, seen) in seen.into_iter().enumerate() {
             let (seed, number) = (seeds[index / n_agents], index % n_agents);
-            // If the first state is known, the belief is certain.
-            let known = seen.truth.as_ref().filter(|_| self.first_state_known);
-            let n_states = worlds.known_model().n_states();
-            let certain = known.map(|states| Belief::from_states(states, n_states));
-            let certain = certain.transpose()?;
             let conditions = Conditions {
                 model: Some(worlds.known_model()),
                 shape: worlds.shape(),
-                prior: Some(certain.as_ref().unwrap_or(prior)),
+                prior: Some(prior),
                 learned: &self.learned,
             };
             let seed = robot_seed(self.config.planner_seed(seed), number);

@@ -103,7 +103,6 @@ impl Trainings<'_> {
             worlds: 0..if kind.is_single { 1 } else { N_WORLDS },
             takeover: false,
             steps,
-            deadline: None,
             resume: false,
             first_seed: None,
             out: self.folder.join(format!("training.{}", std::process::id())),

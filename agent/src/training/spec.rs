@@ -13,7 +13,6 @@ use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::Status;
 use std::ops::Range;
 use std::path::PathBuf;
-use std::time::Instant;
 
 /// Name of the checkpoint in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -25,8 +24,6 @@ pub struct TrainingSpec {
     pub takeover: bool,
     /// World steps to act, summed over all worlds; 0: until stopped.
     pub steps: u64,
-    /// Deadline, which also limits the training of a belief; `None`: no limit.
-    pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
     /// Seed of the first world; world i begins with this seed plus i. `None`: running episodes continue.

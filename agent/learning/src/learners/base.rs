@@ -146,16 +146,8 @@ pub trait Learner: Actor {
 
     fn n_updates(&self) -> u64;
 
-    /// Explains why a run with this number of steps made no update, and what to do.
-    fn lacks(&self, steps: u64) -> String;
-
     /// Returns what was learned, for a checkpoint from which a later run can resume.
     fn contents(&self) -> Result<Contents>;
-}
-
-/// Explains that a run was too short for an update. `name` is the name of the setting for updates per step.
-pub(super) fn lacks_steps(name: &str, updates_per_step: f64) -> String {
-    format!("too few for an update at {name} = {updates_per_step}; train for more --steps")
 }
 
 /// Puts a robot's run in its place, and returns the run of its last episode.

@@ -11,7 +11,7 @@ pub use self::saved::{SHAPE, SavedDecisions};
 use self::run::{Held, Run, features};
 use self::saved::SavedBelief;
 use crate::checkpoint::{Contents, check};
-use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, lacks_steps, replace};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
 use crate::learners::update::ModelUpdate;
 use anyhow::Result;
 use emberwatch_acting::config::AgentConfig;
@@ -229,18 +229,6 @@ impl Learner for DecisionsLearner {
 
     fn n_updates(&self) -> u64 {
         self.dqn.n_updates()
-    }
-
-    fn lacks(&self, _: u64) -> String {
-        let (batch, n) = (self.dqn.settings().batch, self.dqn.remembered().len());
-        if n < batch {
-            return format!(
-                "an update learns from {batch} transitions, and the steps yielded {n}; train for more --steps, or with \
-                 a smaller decisions.batch"
-            );
-        }
-        let rate = self.config.decisions.updates_per_step;
-        lacks_steps("decisions.updates_per_step", rate)
     }
 
     fn contents(&self) -> Result<Contents> {

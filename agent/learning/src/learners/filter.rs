@@ -209,10 +209,6 @@ impl Learner for FilterLearner {
         self.fit.n_updates()
     }
 
-    fn lacks(&self, steps: u64) -> String {
-        self.fit.lacks(steps)
-    }
-
     fn contents(&self) -> Result<Contents> {
         Ok(self.fit.contents())
     }

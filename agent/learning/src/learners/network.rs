@@ -293,15 +293,6 @@ impl Learner for NetworkLearner {
         self.progress.autoencoder.n_updates()
     }
 
-    fn lacks(&self, _: u64) -> String {
-        format!(
-            "an update learns from a window of {} frames of one episode that show some cell twice, and there was no \
-             such window; train for more --steps, on longer episodes (--max-steps of the server), or with a smaller \
-             autoencoder.window",
-            self.config.autoencoder.window
-        )
-    }
-
     fn contents(&self) -> Result<Contents> {
         Ok(self.progress.contents()?)
     }

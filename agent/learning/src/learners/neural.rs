@@ -9,7 +9,7 @@ mod replay;
 use self::behaviour::Behaviour;
 use self::replay::LessonReplay;
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, lacks_steps, replace};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
 use crate::learners::update::ModelUpdate;
 use crate::models::{SavedNeural, SavedNeuralModel, corrected_tensors};
 use crate::reward::{RewardEstimate, met};
@@ -172,7 +172,7 @@ impl Actor for NeuralLearner {
             let (airspace, belief) = (&self.worlds.airspace, agent.belief());
             let plans = match behaviour.values(objective, airspace, target, belief, seen, &mut rng)
             {
-                Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),
+                Some(values) => agent.plan_values(&values, "learning", &cells, k),
                 None => agent.walk(&cells, k),
             };
             run.behaviour = Some(behaviour);
@@ -258,14 +258,6 @@ impl Learner for NeuralLearner {
 
     fn n_updates(&self) -> u64 {
         self.network.n_updates()
-    }
-
-    fn lacks(&self, steps: u64) -> String {
-        let rate = self.config.neural.updates_per_step;
-        if (steps as f64) * rate < 1.0 {
-            return lacks_steps("neural.updates_per_step", rate);
-        }
-        "the frames show no cell".into()
     }
 
     fn contents(&self) -> Result<Contents> {

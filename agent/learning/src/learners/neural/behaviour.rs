@@ -130,18 +130,6 @@ impl Behaviour {
         let values = (0..shape.n_cells()).map(value).collect();
         Grid::from_shape_vec(shape.dim(), values).expect("invariant: one value per cell")
     }
-
-    /// Returns a short description for observers.
-    pub fn label(&self) -> &'static str {
-        match self.aim {
-            Aim::Walk => "random moves",
-            Aim::Cover => "coverage",
-            Aim::Far => "a distant cell",
-            Aim::Last => "sightings of the highest reward",
-            Aim::Exploit { entropy: 0 } => "the highest reward",
-            Aim::Exploit { .. } => "the highest reward, and entropy",
-        }
-    }
 }
 
 #[cfg(test)]
