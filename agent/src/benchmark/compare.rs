@@ -25,7 +25,7 @@ use emberwatch_protocol::feed::Feed;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Comparison {
     /// The policies, in the order of the table.
     pub policies: Vec<Policy>,
@@ -38,26 +38,19 @@ pub struct Comparison {
     pub learned: Learned,
 }
 
-#[derive(Debug, Default)]
-pub struct Results {
-    /// One run per policy, team and world, in the order of the policies.
-    pub runs: Vec<PolicyRun>,
-    /// Number of cells in the state with the highest reward, per step, averaged over worlds. The same for all policies.
-    pub fire_cells: Vec<f32>,
-}
-
-/// Runs every policy on every world. Calls `progress` with a policy's name and the number of world steps just made.
+/// Runs every policy on every world. Returns one run per policy, team and world, in the order of the policies. Calls
+/// `progress` with a policy's name and the number of world steps just made.
 pub fn compare(
     worlds: &mut ComparedWorlds,
     comparison: &Comparison,
     progress: &mut dyn FnMut(&str, u64),
-) -> Result<Results> {
+) -> Result<Vec<PolicyRun>> {
     let config = &comparison.config;
     let prior = config.prior(worlds.info().burn_in);
     let prior = first_belief(prior, worlds.known_model(), worlds.shape(), config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     warn_of_other_worlds(&comparison.learned, worlds.info());
-    let mut results = Results::default();
+    let mut runs = Vec::new();
     let mut feed = worlds.feed(prior.probabilities());
     let entries = comparison.entries();
     // Before other policies run for hours, refuse any policy that cannot run.
@@ -65,7 +58,7 @@ pub fn compare(
         let checked = comparison.check(policy, worlds);
         checked.with_context(|| format!("policy {:?}", policy.name))?;
     }
-    for (index, (policy, team)) in entries.iter().enumerate() {
+    for (policy, team) in &entries {
         worlds.set_team(*team);
         for batch in seeds.chunks(worlds.n_worlds as usize) {
             let started = comparison.start(policy, &prior, worlds, batch, &mut feed);
@@ -77,16 +70,12 @@ pub fn compare(
                 Ok(agents.tallies)
             });
             let tallies = played.with_context(|| format!("policy {:?}", policy.name))?;
-            if index == 0 {
-                results.add_fire(1.0 / seeds.len() as f32, &tallies);
-            }
-            let runs = tallies.into_iter();
-            let runs = runs.map(|tally| tally.into_run(policy, *team, worlds.info()));
-            results.runs.extend(runs);
+            let tallies = tallies.into_iter();
+            runs.extend(tallies.map(|tally| tally.into_run(policy, *team, worlds.info())));
         }
     }
     feed.end();
-    Ok(results)
+    Ok(runs)
 }
 
 impl Comparison {
@@ -149,16 +138,6 @@ impl Comparison {
             n_robots,
             feed,
         })
-    }
-}
-
-impl Results {
-    fn add_fire(&mut self, share: f32, tallies: &[RunTally]) {
-        for cells in tallies.iter().map(|tally| &tally.fire_cells) {
-            self.fire_cells.resize(cells.len(), 0.0);
-            let both = self.fire_cells.iter_mut().zip(cells);
-            both.for_each(|(mean, cells)| *mean += share * cells);
-        }
     }
 }
 

@@ -3,7 +3,7 @@
 use super::shared::{check_csv, make_folder, open_device, write};
 use super::worlds::{Source, WorldFlags};
 use crate::acting::team::Team;
-use crate::benchmark::compare::{Comparison, Results, compare};
+use crate::benchmark::compare::{Comparison, compare};
 use crate::benchmark::compared_worlds::ComparedWorlds;
 use crate::benchmark::report::common_worlds::check_worlds;
 use crate::benchmark::report::runs_file::{read_runs, write_runs};
@@ -102,10 +102,8 @@ impl CompareCommand {
                 learned: learned.clone(),
             };
             self.check_added(&added, &comparison, worlds.info())?;
-            let results = run_comparison(worlds, &comparison)?;
             report.axis_label = axis_label(&worlds.model);
-            report.fire_cells = results.fire_cells;
-            report.runs.extend(results.runs);
+            report.runs.extend(run_comparison(worlds, &comparison)?);
         }
         self.write_results(&report, added, &config)
     }
@@ -225,8 +223,6 @@ impl CompareCommand {
 #[derive(Default)]
 struct Report {
     runs: Vec<PolicyRun>,
-    /// Burning cells per step. They do not depend on the number of robots.
-    fire_cells: Vec<f32>,
     axis_label: String,
     baseline: String,
 }
@@ -235,7 +231,7 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     let label = &*report.axis_label;
     draw_ladder(&directory.join("ladder.svg"), all, label)?;
     let rewards = directory.join("rewards.svg");
-    draw_rewards(&rewards, &report.runs, label, &report.fire_cells)?;
+    draw_rewards(&rewards, &report.runs, label)?;
     draw_teams(&directory.join("teams.svg"), all, label)?;
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
@@ -246,7 +242,7 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
 pub(super) fn run_comparison(
     worlds: &mut ComparedWorlds,
     comparison: &Comparison,
-) -> Result<Results> {
+) -> Result<Vec<PolicyRun>> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
     let n_contestants = comparison.entries().len() as u64;
     let n_steps = n_contestants * n_seeds * comparison.steps;

@@ -160,7 +160,7 @@ impl SuiteCommand {
                 learned: trained.learned,
                 ..plan.comparison.clone()
             };
-            let mut new = run_comparison(&mut worlds, &comparison)?.runs;
+            let mut new = run_comparison(&mut worlds, &comparison)?;
             for run in &mut new {
                 run.task.clone_from(task);
                 run.training_seconds = trained.seconds;

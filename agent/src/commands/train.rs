@@ -298,9 +298,6 @@ pub(super) fn learn(
         mean_reward,
         "done"
     );
-    let [planning_seconds, learning_seconds] =
-        [summary.planning, summary.learning].map(|time| time.as_secs_f64());
-    tracing::info!(planning_seconds, learning_seconds, "time");
     if summary.steps > 0 {
         draw_training(&training.out)?;
     }
