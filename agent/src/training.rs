@@ -46,10 +46,6 @@ pub struct TrainSummary {
     /// Number of updates, including earlier runs that this run resumes.
     pub updates: u64,
     pub reward: f64,
-    /// Time spent on planning paths.
-    pub planning: Duration,
-    /// Time spent on updates.
-    pub learning: Duration,
 }
 
 /// Trains until the steps are done or `stop` is set. Always saves at the end.
@@ -161,9 +157,7 @@ impl<'a> TrainingLoop<'a> {
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) {
             let tick = self.step();
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
-            let start = Instant::now();
             let updates = self.learner.learn();
-            self.summary.learning += start.elapsed();
             let mut updates = updates.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             self.summary.updates = self.learner.n_updates();
             if updates.is_empty() {
@@ -186,7 +180,6 @@ impl<'a> TrainingLoop<'a> {
         let mut shown = ShownLearner::new(learner, self.kind, &mut self.feed, &self.client);
         let mut served = Served::new(&mut self.client, shows_all);
         let records = rollout::step(&mut shown, &mut served)?.unwrap_or_default();
-        self.summary.planning += shown.planning;
         let tick = Tick::of(&records, self.learner.world_steps());
         let robots = self.client.robots();
         let present = (0..robots.len()).map(|index| self.learner.agent(index).observation());

@@ -17,7 +17,7 @@ use std::path::PathBuf;
 /// Name of the checkpoint in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct TrainingSpec {
     /// Worlds to train on, with all their robots.
     pub worlds: Range<u32>,
