@@ -4,7 +4,6 @@
 
 pub mod autoencoder;
 pub mod first_belief;
-mod follower;
 mod kind;
 mod known;
 pub mod learned;

@@ -7,6 +7,7 @@ use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_model::Shape;
 use emberwatch_network::{Autoencoder, Device, Dqn, DqnSettings, DqnShape, NetworkShape};
+use std::sync::Arc;
 
 pub fn shape() -> Shape {
     Shape::new(8, 9).expect("test shape")
@@ -46,7 +47,7 @@ pub fn network(suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
     let dqn = |seed| Dqn::new(DqnSettings::paper(), actions, seed);
     AutoencoderModel {
         autoencoder,
-        dqn: (0..1000).map(dqn).find(suits).expect("a seed that suits"),
+        dqn: Arc::new((0..1000).map(dqn).find(suits).expect("a seed that suits")),
         target: 2,
     }
 }

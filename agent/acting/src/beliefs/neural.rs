@@ -48,7 +48,7 @@ pub const NEURAL: BeliefKind = BeliefKind {
 };
 
 /// A learned neural belief: everything that an agent needs to act on it.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct NeuralModel {
     pub network: NeuralBelief,
     /// The filter whose prediction the network corrects, if any.

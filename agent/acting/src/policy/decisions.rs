@@ -5,7 +5,6 @@ use emberwatch_network::Dqn;
 use std::sync::Arc;
 
 /// The learned values that are used by policies with the planner `options` and the goal `learned`.
-#[derive(Debug, Clone)]
 pub struct LearnedDecisions {
     pub scorer: Arc<Dqn>,
     /// The belief that the decisions were learned on.

@@ -50,18 +50,15 @@ pub enum Chooser {
     Objective(Objective),
     /// A DQN, which reads the estimator after its prediction (paper eq. 17).
     Network(Decider),
-    Options(OptionChooser),
-}
-
-pub type Decider = Box<dyn Fn(&dyn Estimator) -> Objective + Send>;
-
-/// Chooses among options.
-pub enum OptionChooser {
-    Always(&'static PathOption),
+    /// Always the same option.
+    Option(&'static PathOption),
+    /// The option that a hand-written rule chooses.
     Rule,
     /// The option whose features have the highest value under a DQN.
     Scorer(Arc<Dqn>),
 }
+
+pub type Decider = Box<dyn Fn(&dyn Estimator) -> Objective + Send>;
 
 /// The parts of an agent besides its estimator and its policy.
 pub struct Setup {
@@ -123,7 +120,7 @@ impl Agent {
         let objective = match &self.chooser {
             Chooser::Objective(objective) => *objective,
             Chooser::Network(decide) => decide(&*self.estimator),
-            Chooser::Options(_) => return self.plan_options(robots),
+            _ => return self.plan_options(robots),
         };
         self.plan_for(objective, robots, step)
     }
@@ -185,8 +182,8 @@ impl Agent {
 
     fn plan_option(&mut self, layers: &ValueLayers, robot: Cell) -> Plan {
         let option = match &self.chooser {
-            Chooser::Options(OptionChooser::Always(option)) => option,
-            Chooser::Options(OptionChooser::Scorer(scorer)) => {
+            Chooser::Option(option) => option,
+            Chooser::Scorer(scorer) => {
                 let mut proposals = self.options.propose(layers, robot);
                 let features: Vec<f32> = proposals.iter().flat_map(|it| it.features).collect();
                 let best = scorer.best(&features);

@@ -1,6 +1,6 @@
 //! Builds a policy's agent from its belief, its planner and its chooser.
 
-use super::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
+use super::agent::{Agent, Chooser, Decider, Setup};
 use crate::beliefs::autoencoder::{AutoencoderEstimator, AutoencoderModel};
 use crate::beliefs::{Conditions, WorldForm, cast};
 use crate::config::AgentConfig;
@@ -8,7 +8,6 @@ use crate::learned::Learned;
 use crate::policy::{BY_OPTIONS, Goal, Policy, network_choices};
 use anyhow::{Context, Result};
 use emberwatch_belief::planning::Objective;
-use std::sync::Arc;
 
 /// Checks that a policy can act in worlds of the given form with the given checkpoints.
 ///
@@ -53,15 +52,15 @@ pub fn agent(
 
 fn chooser(policy: &Policy, learned: &Learned, target: usize) -> Result<Chooser> {
     if *policy.planner == BY_OPTIONS {
-        return Ok(Chooser::Options(match policy.goal {
-            Goal::Option(option) => OptionChooser::Always(option),
-            Goal::Learned => OptionChooser::Scorer(policy.decisions(learned)?.scorer.clone()),
-            _ => OptionChooser::Rule,
-        }));
+        return Ok(match policy.goal {
+            Goal::Option(option) => Chooser::Option(option),
+            Goal::Learned => Chooser::Scorer(policy.decisions(learned)?.scorer.clone()),
+            _ => Chooser::Rule,
+        });
     }
     Ok(match policy.goal {
         Goal::Learned => {
-            let network = learned.shared::<AutoencoderModel>();
+            let network = learned.get::<AutoencoderModel>();
             let missing = "checkpoint: expected a learned autoencoder, got none";
             Chooser::Network(decider(network.context(missing)?))
         }
@@ -70,13 +69,14 @@ fn chooser(policy: &Policy, learned: &Learned, target: usize) -> Result<Chooser>
 }
 
 /// Returns a function that chooses an objective with the DQN of Algorithm 1, which was trained with an autoencoder.
-fn decider(network: Arc<AutoencoderModel>) -> Decider {
+fn decider(network: &AutoencoderModel) -> Decider {
     let choices = network_choices(network.autoencoder.shape().n_states).into_iter();
     let objectives = choices.map(|choice| choice.objective(network.target));
     let objectives: Vec<Objective> = objectives.collect();
+    let dqn = network.dqn.clone();
     Box::new(move |estimator| {
         let hidden = cast::<AutoencoderEstimator>(estimator).hidden();
-        objectives[network.dqn.best(hidden)]
+        objectives[dqn.best(hidden)]
     })
 }
 

@@ -79,7 +79,7 @@ fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
         n_observations: worlds.n_observations,
         kernel: (learning.kernel[0], learning.kernel[1]),
     };
-    Ok(dimensions.check()?)
+    dimensions.check().map_err(anyhow::Error::msg)
 }
 
 impl FilterLearner {

@@ -10,9 +10,9 @@ use emberwatch_acting::policy::network_choices;
 use emberwatch_model::{MAX_VALUES, Shape};
 use emberwatch_network::{Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// The learned networks and estimates. Estimators contain copies of the autoencoder.
-#[derive(Debug)]
 pub struct Progress {
     pub autoencoder: Autoencoder,
     pub dqn: Dqn,
@@ -101,7 +101,7 @@ impl Progress {
         AutoencoderModel {
             target: self.target(),
             autoencoder: self.autoencoder,
-            dqn: self.dqn,
+            dqn: Arc::new(self.dqn),
         }
     }
 
