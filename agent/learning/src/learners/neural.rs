@@ -11,12 +11,11 @@ use self::replay::LessonReplay;
 use crate::checkpoint::{Contents, check, check_counts};
 use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
 use crate::learners::update::ModelUpdate;
-use crate::models::{SavedNeural, SavedNeuralModel, corrected_tensors};
+use crate::models::{SavedNeural, SavedNeuralModel};
 use crate::reward::{RewardEstimate, met};
 use anyhow::Result;
-use emberwatch_acting::beliefs::learned::LearnedModel;
-use emberwatch_acting::beliefs::neural::{NeuralEstimator, NeuralModel, estimator};
-use emberwatch_acting::beliefs::{LEARNED, LearnedBelief, NEURAL as BELIEF, cast, numbered_states};
+use emberwatch_acting::beliefs::neural::{NeuralEstimator, NeuralModel};
+use emberwatch_acting::beliefs::{NEURAL as BELIEF, numbered_states};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::parallel::in_parallel;
 use emberwatch_acting::policy::Policy;
@@ -24,8 +23,8 @@ use emberwatch_acting::rollout::{
     ActingAgent, Actor, AgentObservation, StepRecord, predict_all, see_all,
 };
 use emberwatch_messages::observation::Observation;
+use emberwatch_model::Move;
 use emberwatch_model::randomness::{Purpose, stream};
-use emberwatch_model::{Move, Probabilities};
 use emberwatch_network::{Device, NeuralBelief};
 
 pub const NEURAL: LearnerKind = LearnerKind {
@@ -34,9 +33,8 @@ pub const NEURAL: LearnerKind = LearnerKind {
     checkpoint: "neural_belief",
     columns: &[],
     is_single: false,
-    flags: &["checkpoint"],
-    base: |_| Ok(Some(&LEARNED)),
-    needs_base: false,
+    flags: &[],
+    base: |_| Ok(None),
     steps: |config| config.neural.steps,
     episode_steps: |config| Some(config.neural.episode_steps),
     done: |contents| Ok(contents.state::<SavedNeural>()?.world_steps),
@@ -49,8 +47,7 @@ pub const NEURAL: LearnerKind = LearnerKind {
 };
 
 fn build(on: LearnerInputs<'_>) -> Result<Box<dyn Learner>> {
-    let filter = on.learned.get::<LearnedModel>();
-    let learner = NeuralLearner::new(on.contents, filter, on.worlds, on.config, on.device);
+    let learner = NeuralLearner::new(on.contents, on.worlds, on.config, on.device);
     Ok(Box::new(learner?))
 }
 
@@ -58,8 +55,6 @@ pub struct NeuralLearner {
     worlds: Worlds,
     config: AgentConfig,
     network: NeuralBelief,
-    /// The filter whose prediction the network corrects, if any.
-    filter: Option<Box<LearnedModel>>,
     reward: RewardEstimate,
     replay: LessonReplay,
     runs: Vec<Run>,
@@ -76,10 +71,9 @@ struct Run {
 }
 
 impl NeuralLearner {
-    /// Creates a learner, or resumes one from a checkpoint. The network corrects the prediction of `filter`, if any.
+    /// Creates a learner, or resumes one from a checkpoint.
     pub fn new(
         contents: Option<&Contents>,
-        filter: Option<&LearnedModel>,
         worlds: Worlds,
         config: &AgentConfig,
         device: &Device,
@@ -87,7 +81,6 @@ impl NeuralLearner {
         let n_observations = worlds.n_observations;
         let mut learner = Self {
             network: NeuralBelief::new(n_observations, config.seed, device)?,
-            filter: filter.cloned().map(Box::new),
             reward: RewardEstimate::new(n_observations),
             replay: LessonReplay::new(config.neural.replay_frames),
             runs: Vec::new(),
@@ -99,8 +92,6 @@ impl NeuralLearner {
         if let Some(contents) = contents {
             learner.load(contents)?;
         }
-        let mut filters = learner.filter.iter();
-        filters.try_for_each(|filter| filter.check_world(&learner.worlds.form()))?;
         Ok(learner)
     }
 
@@ -112,8 +103,7 @@ impl NeuralLearner {
 
     /// Creates a robot's agent, whose belief has not been corrected yet.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
-        let filter = self.filter.as_deref();
-        let estimator = estimator(&self.network, filter, self.worlds.shape())?;
+        let estimator = NeuralEstimator::new(&self.network, self.worlds.shape())?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, target) = (Policy::exploiting(&BELIEF), self.paying());
         let (estimator, worlds) = (Box::new(estimator), &self.worlds);
@@ -147,7 +137,6 @@ impl NeuralLearner {
         ])?;
         contents.check_squares()?;
         saved.reward.check(expected)?;
-        self.filter = saved.model.read_filter(&contents.part(""))?;
         let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
         self.network.load(find, saved.n_updates)?;
         (self.reward, self.world_steps) = (saved.reward, saved.world_steps);
@@ -196,8 +185,7 @@ impl Actor for NeuralLearner {
             let flight = self.worlds.airspace.fly(start, &run.path);
             self.reward
                 .add(&met(belief, &flight.visited), record.reward);
-            let base = base(&run.acting);
-            self.replay.push(robot, &observation.frame, base);
+            self.replay.push(robot, &observation.frame);
         }
         let n_robots = records.len() as u64;
         self.world_steps += n_robots;
@@ -214,8 +202,7 @@ impl Learner for NeuralLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
         let mut acting = self.agent_at(observation)?;
         self.replay.start_track(robot, self.worlds.shape());
-        let base = base(&acting);
-        self.replay.push(robot, &acting.observation().frame, base);
+        self.replay.push(robot, &acting.observation().frame);
         acting.correct()?;
         acting.agent.predict();
         let run = Run {
@@ -263,7 +250,6 @@ impl Learner for NeuralLearner {
     fn contents(&self) -> Result<Contents> {
         let model = NeuralModel {
             network: self.network.clone(),
-            filter: self.filter.clone(),
             target: self.paying(),
         };
         let state = SavedNeural {
@@ -272,13 +258,6 @@ impl Learner for NeuralLearner {
             n_updates: self.n_updates(),
             world_steps: self.world_steps,
         };
-        let filter = self.filter.iter().flat_map(|it| corrected_tensors(it));
-        let tensors = self.network.named_tensors()?.into_iter().chain(filter);
-        Ok(Contents::new(tensors, &state))
+        Ok(Contents::new(self.network.named_tensors()?, &state))
     }
-}
-
-/// Returns the distribution of each cell's next observation that the refined filter predicts, shape `[O, H, W]`.
-fn base(acting: &ActingAgent) -> Option<&Probabilities> {
-    cast::<NeuralEstimator>(acting.agent.estimator()).base()
 }
