@@ -5,7 +5,6 @@ use crate::tensors::{Change, copied, set, zero_if_finite};
 use crate::variables::{Variables, is_statistic};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
-use serde::{Deserialize, Serialize};
 
 /// A constant that is added to moments and subtracted again. Because of rounding, moments whose gradients stay zero
 /// then stop decaying at a few rounding errors of this constant. Moments therefore never become subnormal numbers,
@@ -13,8 +12,7 @@ use serde::{Deserialize, Serialize};
 const FLUSH: f64 = 1e-30;
 
 /// Settings of Adam.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamSettings {
     /// The learning rate.
     pub learning_rate: f32,

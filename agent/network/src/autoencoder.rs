@@ -15,12 +15,10 @@ use crate::window::Window;
 use candle_core::{DType, Device, Tensor};
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::randomness::{Purpose, stream};
-use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// Settings of the autoencoder.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AutoencoderSettings {
     /// Length of the encoder's output.
     pub encoding: usize,

@@ -27,9 +27,6 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
 
-/// Default number of training worlds, except for a learner that follows a single world.
-pub(super) const N_WORLDS: u32 = 16;
-
 /// Learn a model while acting.
 #[derive(Args)]
 pub struct TrainCommand {
@@ -116,9 +113,7 @@ impl TrainCommand {
         if let Some(coverage) = &self.coverage {
             config.full_frames = coverage == "full";
         }
-        let n_worlds = self
-            .worlds
-            .unwrap_or(if kind.is_single { 1 } else { N_WORLDS });
+        let n_worlds = self.worlds.unwrap_or(kind.n_worlds());
         let last = self.world.checked_add(n_worlds);
         let last = last.with_context(|| {
             let world = self.world;

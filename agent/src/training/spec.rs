@@ -84,10 +84,7 @@ impl TrainingSpec {
         belief.resume = self.resume && belief.out.join(CHECKPOINT).exists();
         let kind = belief.learner()?;
         let done = belief.check()?.map(|contents| (kind.done)(&contents));
-        let all = match (kind.steps)(&self.config) {
-            0 => self.config.decisions.filter_steps,
-            steps => steps,
-        };
+        let all = kind.full_steps(&self.config);
         belief.steps = all.saturating_sub(done.transpose()?.unwrap_or(0));
         Ok((belief.steps > 0).then_some(belief))
     }

@@ -53,6 +53,21 @@ impl PartialEq for LearnerKind {
     }
 }
 
+impl LearnerKind {
+    /// Returns the default number of worlds of a training.
+    pub fn n_worlds(&self) -> u32 {
+        if self.is_single { 1 } else { 16 }
+    }
+
+    /// Returns the number of world steps of a training that another one or a suite needs. 0 means that there is none.
+    pub fn full_steps(&self, config: &AgentConfig) -> u64 {
+        match (self.steps)(config) {
+            0 if !self.is_single => config.decisions.filter_steps,
+            steps => steps,
+        }
+    }
+}
+
 impl fmt::Debug for LearnerKind {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(self.name)
@@ -99,8 +114,7 @@ impl Worlds {
         self.airspace.shape()
     }
 
-    /// Creates an agent whose belief has not been corrected yet. `target` is the index of the state with the highest
-    /// reward.
+    /// Creates an agent at its first observation. `target` is the index of the state with the highest reward.
     pub(super) fn new_agent(
         &self,
         config: &AgentConfig,
@@ -108,7 +122,7 @@ impl Worlds {
         estimator: Box<dyn Estimator>,
         state_names: Vec<String>,
         observation: Observation,
-    ) -> ActingAgent {
+    ) -> Result<ActingAgent> {
         let setup = Setup {
             airspace: self.airspace.clone(),
             beam_width: config.decisions.beam_width,
@@ -119,7 +133,7 @@ impl Worlds {
             chooser: Chooser::Objective(policy.objective(target)),
         };
         let agent = Agent::new(estimator, policy, config, setup);
-        ActingAgent::new(agent, AgentObservation::new([observation]))
+        ActingAgent::begun(agent, AgentObservation::new([observation]))
     }
 }
 

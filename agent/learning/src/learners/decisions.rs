@@ -97,12 +97,12 @@ impl DecisionsLearner {
         Ok(learner)
     }
 
-    /// Creates an agent whose belief has not been corrected yet.
+    /// Creates an agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let (base, names) = (&self.base, self.base.state_names.clone());
         let (config, policy) = (&self.config, (&self.policy, self.base.target));
         let (estimator, worlds) = (base.estimator()?, &self.worlds);
-        Ok(worlds.new_agent(config, policy, estimator, names, observation))
+        worlds.new_agent(config, policy, estimator, names, observation)
     }
 
     /// Chooses the option that a robot flies: the option with the highest value, or a random option that it keeps for
@@ -187,10 +187,7 @@ impl Actor for DecisionsLearner {
 
 impl Learner for DecisionsLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let mut acting = self.agent_at(observation)?;
-        acting.correct()?;
-        acting.agent.predict();
-        let run = Run::begun(acting, &self.dqn);
+        let run = Run::begun(self.agent_at(observation)?, &self.dqn);
         if let Some(mut ended) = replace(&mut self.runs, &self.worlds, robot, run) {
             let transitions = ended.end(&self.dqn).into_iter();
             transitions.for_each(|transition| self.dqn.remember(transition));

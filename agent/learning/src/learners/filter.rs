@@ -101,8 +101,8 @@ impl FilterLearner {
         })
     }
 
-    /// Creates a robot's agent, whose belief has not been corrected yet.
-    fn agent_at(&self, observation: Observation) -> ActingAgent {
+    /// Creates a robot's agent at its first observation.
+    fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));
         let names = numbered_states(tables.dimensions.n_states);
@@ -179,9 +179,7 @@ impl Learner for FilterLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
         self.fit.start_track(robot);
         self.fit.see(robot, &observation.frame, None, &self.learned);
-        let mut acting = self.agent_at(observation);
-        acting.correct()?;
-        acting.agent.predict();
+        let acting = self.agent_at(observation)?;
         replace(&mut self.agents, &self.worlds, robot, acting);
         Ok(())
     }

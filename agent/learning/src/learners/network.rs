@@ -247,11 +247,8 @@ impl Learner for NetworkLearner {
         let names = numbered_states(network.shape().n_states);
         // The initial policy is the first choice, whose target is the first state.
         let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
-        let mut acting =
-            worlds.new_agent(&self.config, first, Box::new(estimator), names, observation);
-        acting.correct()?;
-        acting.agent.predict();
-        self.acting = Some(acting);
+        let acting = worlds.new_agent(&self.config, first, Box::new(estimator), names, observation);
+        self.acting = Some(acting?);
         Ok(())
     }
 

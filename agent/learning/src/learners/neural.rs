@@ -101,19 +101,14 @@ impl NeuralLearner {
         self.reward.target().unwrap_or(last)
     }
 
-    /// Creates a robot's agent, whose belief has not been corrected yet.
+    /// Creates a robot's agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let estimator = NeuralEstimator::new(&self.network, self.worlds.shape())?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, target) = (Policy::exploiting(&BELIEF), self.paying());
         let (estimator, worlds) = (Box::new(estimator), &self.worlds);
-        Ok(worlds.new_agent(
-            &self.config,
-            (&policy, target),
-            estimator,
-            names,
-            observation,
-        ))
+        let policy = (&policy, target);
+        worlds.new_agent(&self.config, policy, estimator, names, observation)
     }
 
     /// Returns the completed fraction of the training steps.
@@ -200,13 +195,10 @@ impl Actor for NeuralLearner {
 
 impl Learner for NeuralLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let mut acting = self.agent_at(observation)?;
         self.replay.start_track(robot, self.worlds.shape());
-        self.replay.push(robot, &acting.observation().frame);
-        acting.correct()?;
-        acting.agent.predict();
+        self.replay.push(robot, &observation.frame);
         let run = Run {
-            acting,
+            acting: self.agent_at(observation)?,
             behaviour: None,
             path: Vec::new(),
         };
