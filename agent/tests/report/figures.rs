@@ -107,7 +107,7 @@ fn unusual_values_and_names_are_drawn_or_omitted() {
             bars: vec![bar(HOSTILE), bar(&long())],
         };
         check_page(&page.svg().expect("drawn"), &["</text>", "a very"]);
-        let points = vec![(0.0, value), (value, 1.0), (5.0, 2.0)];
+        let points = [(0.0, value), (value, 1.0), (5.0, 2.0)];
         let point = |&(x, y): &(f64, f64)| Point { x, y, error: value };
         let curve = |name: &str| Curve {
             name: name.into(),

@@ -42,11 +42,10 @@ pub struct Dimensions {
 
 /// Three tensors in the order of [`Parameters::NAMES`], which contain unconstrained values, the gradients of these
 /// values, or their Adam moments.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
     pub dimensions: Dimensions,
     /// `[S, S, KH, KW]`, `[S, O]`, and `[S]`, row-major.
-    #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
 }
 
