@@ -128,7 +128,7 @@ fn a_training_that_ended_in_its_filter_resumes_there() {
         "given",
         &format!("{given} {filter}"),
         "--estimator known => --checkpoint | known
---learner filter => --checkpoint applies only with --learner decisions",
+--learner filter => --checkpoint applies only with --learner neural or decisions",
     );
     let spatial = "--estimator learned+spatial";
     place.train("given", &format!("{given} {filter} {spatial}"));

@@ -49,8 +49,23 @@ fn a_neural_belief_is_learned_resumed_and_acted_on() {
 }
 
 #[test]
-fn decisions_learn_on_a_neural_belief() {
+fn a_neural_belief_corrects_a_filter_and_decisions_learn_on_it() {
     let place = Place::new(SETTINGS, HEADER);
+    place.train("filter", &format!("{WORLDS} --learner filter --steps 40"));
+    let filter = place.flag("filter");
+    place.learn("out", &format!("{WORLDS} {filter} --steps 40"));
+    let again = format!("{WORLDS} {filter} --resume");
+    place.refuse(
+        "out",
+        &again,
+        "--resume | cannot be used with | --checkpoint",
+    );
+    place.learn("out", &format!("{WORLDS} --resume"));
+    let policies = "--policies neural_beam --baseline neural_beam";
+    place.compare("out", policies).check_prints("neural_beam");
+    let wrong = format!("{WORLDS} {}", place.flag("out"));
+    place.refuse("other", &wrong, "--checkpoint | for the estimator learned");
+
     let flags = format!("{WORLDS} --learner decisions --estimator neural");
     place.train("decisions", &format!("{flags} --steps 10"));
     assert!(place.checkpoint("decisions/belief").exists());

@@ -63,8 +63,10 @@ pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::beliefs::learned::LearnedModel;
     use crate::beliefs::neural::NeuralModel;
     use crate::learned::Learned;
+    use crate::testing::learned_filter;
     use emberwatch_belief::Belief;
     use emberwatch_model::{Frame, Model, Shape};
     use emberwatch_network::{Device, NeuralBelief};
@@ -86,10 +88,11 @@ mod tests {
             Frame::from_bytes(shape, 3, &values).expect("a frame")
         };
         let prior = Belief::uniform(3, shape);
-        let refuses = |kind: &BeliefKind| {
+        let refuses = |kind: &BeliefKind, filter: Option<LearnedModel>| {
             let mut learned = Learned::default();
             learned.put(NeuralModel {
                 network: NeuralBelief::new(3, 1, &Device::Cpu).expect("a network"),
+                filter: filter.map(Box::new),
                 target: 1,
             });
             let conditions = Conditions {
@@ -122,9 +125,10 @@ mod tests {
             .iter()
             .filter(|kind| kind.knows_model && kind.input == Input::Frames);
         for kind in knowing.copied().filter(|kind| kind.learned_by.is_none()) {
-            refuses(kind);
+            refuses(kind, None);
         }
-        refuses(&NEURAL);
+        refuses(&NEURAL, None);
+        refuses(&NEURAL, Some(learned_filter()));
     }
 
     #[test]

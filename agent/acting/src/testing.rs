@@ -1,7 +1,10 @@
 //! Worlds, settings and learned models of unit tests.
 
 use crate::beliefs::autoencoder::AutoencoderModel;
+use crate::beliefs::learned::LearnedModel;
 use crate::config::AgentConfig;
+use emberwatch_belief::estimation::Correlations;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_model::Shape;
 use emberwatch_network::{Autoencoder, Device, Dqn, DqnSettings, DqnShape, NetworkShape};
 use std::sync::Arc;
@@ -16,6 +19,17 @@ pub fn config() -> AgentConfig {
         shooting_samples: 64,
         ..AgentConfig::default()
     }
+}
+
+/// A filter with its initial parameters.
+pub fn learned_filter() -> LearnedModel {
+    let dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 3,
+        kernel: (3, 3),
+    };
+    let parameters = Parameters::first(dimensions, AgentConfig::default().seed);
+    LearnedModel::new(parameters, 2, Correlations::default())
 }
 
 /// An untrained network. The seed of its DQN is the lowest seed with which the DQN satisfies the condition `suits`.

@@ -18,8 +18,8 @@ pub mod truth;
 
 pub use bayes::ZeroEvidence;
 pub use correlations::Correlations;
-pub use estimator::{Estimator, EstimatorError, Handover, ObservationModel, Told};
+pub use estimator::{Estimator, EstimatorError, Filter, Handover, ObservationModel, Told};
 pub use filter::BayesFilter;
 pub use kept_belief::KeptBelief;
 pub use prior::Prior;
-pub use spatial::SpatialFilter;
+pub use spatial::{SpatialFilter, correcting};

@@ -178,6 +178,14 @@ pub struct Part<'a> {
 }
 
 impl Part<'_> {
+    /// Returns the tensors of this part whose names begin with a further prefix.
+    pub fn part(&self, prefix: &str) -> Self {
+        Self {
+            contents: self.contents,
+            prefix: format!("{}{prefix}", self.prefix),
+        }
+    }
+
     /// Returns the values of a tensor of this part, with the same checks as [`Contents::tensor`].
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         self.contents

@@ -1,4 +1,4 @@
-//! Learned models in checkpoints: the filter and the neural belief.
+//! Learned models in checkpoints: the filter, and the neural belief with the filter that it may correct.
 
 use crate::checkpoint::{Part, check, wrong};
 use crate::reward::RewardEstimate;
@@ -8,8 +8,11 @@ use emberwatch_acting::beliefs::neural::NeuralModel;
 use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_model::MAX_VALUES;
-use emberwatch_network::{Device, NamedTensor, NeuralBelief};
+use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief};
 use serde::{Deserialize, Serialize};
+
+/// Prefix of the names of the corrected filter's tensors.
+const FILTER: &str = "filter.";
 
 /// The part of a [`LearnedModel`] that a checkpoint stores besides the tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -36,6 +39,11 @@ impl SavedModel {
         let correlations = self.correlations.clone();
         Ok(LearnedModel::new(parameters, self.target, correlations))
     }
+
+    /// Returns the number of observations.
+    pub fn n_observations(&self) -> usize {
+        self.dimensions.n_observations
+    }
 }
 
 /// The part of a [`NeuralModel`] that a checkpoint stores besides the tensors.
@@ -43,17 +51,18 @@ impl SavedModel {
 pub struct SavedNeuralModel {
     n_observations: usize,
     target: usize,
-    /// Always false. In files of earlier versions, true precedes a filter that the network corrects.
-    corrects_filter: bool,
+    /// The filter whose prediction the network corrects.
+    filter: Option<Box<SavedModel>>,
 }
 
 impl SavedNeuralModel {
     /// Extracts the stored part of a model.
     pub fn of(model: &NeuralModel) -> Self {
+        let filter = model.filter.as_deref();
         Self {
             n_observations: model.network.n_observations(),
             target: model.target,
-            corrects_filter: false,
+            filter: filter.map(|it| Box::new(SavedModel::of(it))),
         }
     }
 
@@ -73,8 +82,19 @@ impl SavedNeuralModel {
         network.set_parameters(|name: &str, shape: &[usize]| part.tensor(name, shape))?;
         Ok(NeuralModel {
             network,
+            filter: self.read_filter(part)?,
             target: self.target,
         })
+    }
+
+    /// Loads the corrected filter, if there is one.
+    pub fn read_filter(&self, part: &Part<'_>) -> Result<Option<Box<LearnedModel>>> {
+        let Some(filter) = &self.filter else {
+            return Ok(None);
+        };
+        let (expected, got) = (self.n_observations, filter.n_observations());
+        check(got == expected, "filter.n_observations", expected, got)?;
+        Ok(Some(Box::new(filter.read(&part.part(FILTER))?)))
     }
 }
 
@@ -95,6 +115,22 @@ pub type SavedNeural = SavedBeliefLearner<SavedNeuralModel>;
 /// Returns the parameters of a filter as named tensors.
 pub fn filter_tensors(model: &LearnedModel) -> [NamedTensor; 3] {
     named_tensors(&model.parameters, "")
+}
+
+/// Returns the parameters of a network, and of the filter that it corrects, as named tensors.
+///
+/// # Errors
+/// If the network's device fails.
+pub fn neural_tensors(model: &NeuralModel) -> Result<Vec<NamedTensor>, NetworkError> {
+    let filter = model.filter.as_deref().map(corrected_tensors);
+    let parameters = model.network.parameters()?.into_iter();
+    Ok(parameters.chain(filter.into_iter().flatten()).collect())
+}
+
+/// Returns the tensors of a corrected filter, with the prefix `filter.`.
+pub fn corrected_tensors(filter: &LearnedModel) -> impl Iterator<Item = NamedTensor> + use<> {
+    let named = |(name, shape, numbers)| (format!("{FILTER}{name}"), shape, numbers);
+    filter_tensors(filter).into_iter().map(named)
 }
 
 /// Checks that the target is the index of a state.

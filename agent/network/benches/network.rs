@@ -154,6 +154,7 @@ fn neural_belief(c: &mut Criterion) {
             lessons.push(Lesson {
                 before: before.clone(),
                 frame: frame.clone(),
+                base: Vec::new(),
             });
         }
         for (cell, value) in frame {
@@ -167,7 +168,7 @@ fn neural_belief(c: &mut Criterion) {
         b.iter(|| network.update(2e-3, &lessons).expect("finite"));
     });
     for n in [1, 16, 64] {
-        let worlds = vec![&before; n];
+        let worlds = vec![(&before, None); n];
         group.bench_function(format!("prediction of {n}"), |b| {
             b.iter(|| network.predict_all(&worlds).expect("predictions"));
         });

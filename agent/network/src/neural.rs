@@ -12,7 +12,7 @@ use crate::sightings::{Features, Sightings};
 use crate::tensors::{NamedTensor, found, named_numbers, set};
 use crate::unet::UNet;
 use crate::variables::{Variables, build};
-use candle_core::{D, DType, Device, Result as CandleResult, Tensor};
+use candle_core::{D, DType, Device, Result as CandleResult, Shape, Tensor};
 use candle_nn::ops::{log_softmax, softmax};
 use emberwatch_model::grid::Probabilities;
 use rayon::prelude::*;
@@ -36,6 +36,10 @@ const BATCH_CELLS: usize = 65_536;
 /// Maximum number of cells in one pass of predictions with candle's operators: 64 grids of 64 x 64.
 const PASS_CELLS: usize = 262_144;
 
+/// The sightings of a world, and, if the network corrects the predictions of a filter, the filter's prediction,
+/// `[O, H, W]`.
+pub type AgentObservation<'a> = (&'a Sightings, Option<&'a Probabilities>);
+
 /// The network, its variables and its optimiser. Clones share the variables, so an update of one clone changes all.
 #[derive(Clone)]
 pub struct NeuralBelief {
@@ -54,6 +58,9 @@ pub struct Lesson {
     pub before: Sightings,
     /// The row-major index and the value of each observed cell, for at least one cell.
     pub frame: Vec<(usize, u8)>,
+    /// The prediction for the observed cells, `[cells, O]`, by the filter that the network corrects. Empty if the
+    /// network corrects no filter.
+    pub base: Vec<f32>,
 }
 
 impl NeuralBelief {
@@ -121,22 +128,30 @@ impl NeuralBelief {
         Ok(set(&changes).map_err(NetworkError::from)?)
     }
 
-    /// Predicts the distribution of each cell's observation in the current step, `[O, H, W]`.
+    /// Predicts the distribution of each cell's observation in the current step, `[O, H, W]`. `base` is the prediction
+    /// of the filter that the network corrects, if it corrects one.
     ///
     /// # Errors
     /// If a value is not finite, or the device fails.
-    pub fn predict(&self, sightings: &Sightings) -> Result<Probabilities, NetworkError> {
-        let mut all = self.predict_in_one_pass(&[sightings])?;
+    pub fn predict(
+        &self,
+        sightings: &Sightings,
+        base: Option<&Probabilities>,
+    ) -> Result<Probabilities, NetworkError> {
+        let mut all = self.predict_in_one_pass(&[(sightings, base)])?;
         Ok(all.swap_remove(0))
     }
 
-    /// Predicts several worlds with the same grid, each as [`Self::predict`] does. Our operators predict one world per
-    /// thread, and candle's operators many worlds in one pass.
+    /// Predicts several worlds with the same grid, each as [`Self::predict`] does. Either all worlds have a base or
+    /// none does. Our operators predict one world per thread, and candle's operators many worlds in one pass.
     ///
     /// # Errors
     /// The same as for [`Self::predict`].
-    pub fn predict_all(&self, worlds: &[&Sightings]) -> Result<Vec<Probabilities>, NetworkError> {
-        let Some(first) = worlds.first() else {
+    pub fn predict_all(
+        &self,
+        worlds: &[AgentObservation<'_>],
+    ) -> Result<Vec<Probabilities>, NetworkError> {
+        let Some((first, _)) = worlds.first() else {
             return Ok(Vec::new());
         };
         let passes = match self.operators {
@@ -164,14 +179,21 @@ impl NeuralBelief {
 
     fn predict_in_one_pass(
         &self,
-        worlds: &[&Sightings],
+        worlds: &[AgentObservation<'_>],
     ) -> Result<Vec<Probabilities>, NetworkError> {
-        let shape = worlds[0].shape();
+        let (n, shape) = (worlds.len(), worlds[0].0.shape());
         let (crop, (height, width)) = (Crop::whole(shape), shape.dim());
-        let images = worlds.iter().map(|sightings| (*sightings, &crop));
+        let images = worlds.iter().map(|(sightings, _)| (*sightings, &crop));
         let logits = self.unet.logits(&self.images(images, crop.sides)?)?;
         let logits = logits.narrow(2, 0, height)?.narrow(3, 0, width)?;
+        let bases: Vec<_> = worlds.iter().filter_map(|(_, base)| *base).collect();
         let (o, logits) = (self.n_observations, logits.contiguous()?);
+        let logits = if bases.is_empty() {
+            logits
+        } else {
+            let bases = bases.into_iter().flatten();
+            (logits + self.logarithms(bases, (n, o, height, width))?)?
+        };
         let probabilities = softmax(&logits, 1)?.affine(1.0 - o as f64 * LEAST, LEAST)?;
         let numbers: Vec<f32> = probabilities.flatten_all()?.to_vec1()?;
         if !numbers.iter().all(|number| number.is_finite()) {
@@ -189,7 +211,7 @@ impl NeuralBelief {
     /// and 11). The network reads crops around the observed cells. Lessons beyond the size of a batch are ignored.
     ///
     /// # Panics
-    /// If there is no lesson, or a lesson has no cells.
+    /// If there is no lesson, if a lesson has no cells, or if only some lessons have a base.
     pub fn loss(&self, lessons: &[Lesson]) -> Result<Tensor, NetworkError> {
         let shape = lessons[0].before.shape();
         let extents = lessons.iter().map(|it| extent(shape, it.cells()));
@@ -210,9 +232,18 @@ impl NeuralBelief {
                 values.push(u32::from(value));
             }
         }
+        let base: Vec<f32> = lessons[..n]
+            .iter()
+            .flat_map(|it| &it.base)
+            .copied()
+            .collect();
+        assert!(
+            base.is_empty() || base.len() == cells.len() * self.n_observations,
+            "lessons: expected a base for all cells or for no cell"
+        );
         Ok(match self.operators {
-            Operators::Own => self.loss_at(&images, &cells, values)?,
-            Operators::Stock => self.loss_of_all(&images, &cells, &values)?,
+            Operators::Own => self.loss_at(&images, &cells, values, &base)?,
+            Operators::Stock => self.loss_of_all(&images, &cells, &values, &base)?,
         })
     }
 
@@ -222,8 +253,14 @@ impl NeuralBelief {
         images: &Tensor,
         cells: &[[usize; 3]],
         values: Vec<u32>,
+        base: &[f32],
     ) -> CandleResult<Tensor> {
         let logits = self.unet.logits_at(images, cells)?;
+        let logits = if base.is_empty() {
+            logits
+        } else {
+            (logits + self.logarithms(base.iter(), (cells.len(), self.n_observations))?)?
+        };
         let values = Tensor::new(values, &self.device)?.unsqueeze(1)?;
         let log_p = log_softmax(&logits, D::Minus1)?.gather(&values, 1)?;
         log_p.mean_all()?.neg()
@@ -236,6 +273,7 @@ impl NeuralBelief {
         images: &Tensor,
         cells: &[[usize; 3]],
         values: &[u32],
+        base: &[f32],
     ) -> CandleResult<Tensor> {
         let logits = self.unet.logits(images)?;
         let (_, n, rows, cols) = logits.dims4()?;
@@ -247,6 +285,17 @@ impl NeuralBelief {
             weights[at(cell, *value as usize)] -= 1.0 / cells.len() as f32;
         }
         let weights = Tensor::from_vec(weights, logits.shape(), &self.device)?;
+        let logits = if base.is_empty() {
+            logits
+        } else {
+            let mut of_all = vec![1.0_f32; logits.elem_count()];
+            for (cell, base) in cells.iter().zip(base.chunks(n)) {
+                for (value, base) in base.iter().enumerate() {
+                    of_all[at(cell, value)] = *base;
+                }
+            }
+            (&logits + self.logarithms(of_all.iter(), logits.shape())?)?
+        };
         (log_softmax(&logits, 1)? * weights)?.sum_all()
     }
 
@@ -287,6 +336,16 @@ impl NeuralBelief {
         set(&changes).map_err(NetworkError::from)?;
         self.adam.set_steps(n_updates);
         Ok(())
+    }
+
+    /// Returns the logarithms of probabilities, after raising each probability to at least [`LEAST`].
+    fn logarithms<'a>(
+        &self,
+        probabilities: impl Iterator<Item = &'a f32>,
+        shape: impl Into<Shape>,
+    ) -> CandleResult<Tensor> {
+        let logarithms = probabilities.map(|p| p.max(LEAST as f32).ln());
+        Tensor::from_vec(logarithms.collect(), shape.into(), &self.device)
     }
 
     /// Computes the network's input for crops with the given sides, `[crops, features, rows, cols]`.

@@ -40,7 +40,8 @@ pub struct TrainCommand {
     /// the remaining steps of the settings]
     #[arg(long)]
     steps: Option<u64>,
-    /// Checkpoint of the --estimator from an earlier training; without it, a learned estimator is trained first
+    /// Checkpoint of the --estimator from an earlier training; without it, a learned estimator is trained first. With
+    /// --learner neural: a filter whose belief the network corrects
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     checkpoint: Option<PathBuf>,
     /// Resume from the folder's checkpoint, in worlds that the training has not seen. The replay buffer starts empty
@@ -263,7 +264,7 @@ pub(super) fn simulate(mut settings: Checked, training: &TrainingSpec) -> Result
 /// Returns whether the belief that the learner builds on must be trained first.
 fn needs_belief(training: &TrainingSpec) -> Result<bool> {
     let is_missing = |base: &BeliefKind| base.learned(&training.learned).is_err();
-    Ok(training.base()?.is_some_and(is_missing))
+    Ok(training.learner()?.needs_base && training.base()?.is_some_and(is_missing))
 }
 
 /// Trains the belief that decisions are based on, unless its training is complete.

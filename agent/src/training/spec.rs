@@ -93,7 +93,7 @@ impl TrainingSpec {
     /// determines, and returns the number of world steps done.
     pub fn adopt_belief(&mut self) -> Result<Option<u64>> {
         let place = self.belief_folder().join(CHECKPOINT);
-        if self.base()?.is_none() || self.out.join(CHECKPOINT).exists() || !place.exists() {
+        if !self.learner()?.needs_base || self.out.join(CHECKPOINT).exists() || !place.exists() {
             return Ok(None);
         }
         let (_, contents) = checkpoint::read(&place)?;

@@ -4,7 +4,7 @@ use super::world_form::WorldForm;
 use crate::learned::Learned;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::{Estimator, Handover, ObservationModel, Told};
+use emberwatch_belief::estimation::{Estimator, Filter, Handover, ObservationModel, Told};
 use emberwatch_model::{Model, Shape};
 use std::any::Any;
 use std::fmt;
@@ -59,7 +59,7 @@ impl Traits {
     };
 
     /// Returns the optional traits of a filter.
-    pub const fn of_filter<E: Estimator + ObservationModel + Handover>() -> Self {
+    pub const fn of_filter<E: Filter>() -> Self {
         Self {
             observation_model: Some(|it| cast::<E>(it)),
             handover: Some(|it| cast::<E>(it)),

@@ -6,7 +6,7 @@ use super::kind::{BeliefKind, Conditions, Input, LearnedBelief, LearnedBy, Trait
 use super::world_form::WorldForm;
 use anyhow::{Context, Result};
 use emberwatch_belief::estimation::parameters::{Parameters, Tables};
-use emberwatch_belief::estimation::{BayesFilter, Correlations, SpatialFilter};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Filter, SpatialFilter, correcting};
 use emberwatch_model::Shape;
 
 pub const LEARNED: BeliefKind = BeliefKind {
@@ -24,22 +24,14 @@ pub const LEARNED: BeliefKind = BeliefKind {
     }),
     chart: ("learned", [0x00, 0x9e, 0x73]),
     traits: Traits::of_filter::<BayesFilter>(),
-    build: |conditions| Ok(Box::new(model(conditions)?.filter(conditions.shape))),
+    build: |conditions| Ok(model(conditions)?.estimator(false, conditions.shape)),
 };
 
 pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     name: "learned+spatial",
     about: "learned, where observations also correct neighbouring cells",
     traits: Traits::of_filter::<SpatialFilter>(),
-    build: |conditions| {
-        let model = model(conditions)?;
-        let (filter, correlations) = (model.filter(conditions.shape), model.correlations.clone());
-        Ok(Box::new(SpatialFilter::new(
-            filter,
-            model.target,
-            correlations,
-        )))
-    },
+    build: |conditions| Ok(model(conditions)?.estimator(true, conditions.shape)),
     ..LEARNED
 };
 
@@ -71,9 +63,13 @@ impl LearnedModel {
         }
     }
 
-    /// Builds the filter before its first frame.
-    pub fn filter(&self, shape: Shape) -> BayesFilter {
-        BayesFilter::learned(&self.tables, self.tables.prior(shape))
+    /// Builds an estimator before its first frame.
+    ///
+    /// If `is_spatial`, corrections reach the neighbours of visited cells.
+    pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Box<dyn Filter> {
+        let filter = BayesFilter::learned(&self.tables, self.tables.prior(shape));
+        let neighbours = || (self.target, self.correlations.clone());
+        correcting(filter, is_spatial.then(neighbours))
     }
 }
 

@@ -1,18 +1,19 @@
 //! The neural belief: an estimator whose network predicts the next observation of each cell.
 //!
-//! The network reads each cell's last observation and its age.
+//! The network reads each cell's last observation and its age. It can also read a filter's prediction and correct it.
 //!
 //! The belief is about observations instead of states, so S = O. After a frame, the observations of visited cells have
 //! probability 1.
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy, Traits, cast_mut};
-use super::learned::LEARNED;
+use super::learned::{LEARNED, LearnedModel};
 use super::world_form::WorldForm;
+use crate::parallel::in_parallel;
 use anyhow::{Context, Result};
-use emberwatch_belief::estimation::bayes::correct;
+use emberwatch_belief::estimation::bayes::{check as check_evidence, correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{
-    Estimator, EstimatorError, Handover, ObservationModel,
+    Estimator, EstimatorError, Filter, Handover, ObservationModel,
 };
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, Shape};
@@ -50,22 +51,26 @@ pub const NEURAL: BeliefKind = BeliefKind {
 #[derive(Clone)]
 pub struct NeuralModel {
     pub network: NeuralBelief,
+    /// The filter whose prediction the network corrects, if any.
+    pub filter: Option<Box<LearnedModel>>,
     /// The observation with the highest reward.
     pub target: usize,
 }
 
-/// Models are equal if their targets and network parameters are equal.
+/// Models are equal if their targets, filters and network parameters are equal.
 impl PartialEq for NeuralModel {
     fn eq(&self, other: &Self) -> bool {
         let parameters = |model: &Self| model.network.parameters().ok();
-        self.target == other.target && parameters(self) == parameters(other)
+        self.target == other.target
+            && self.filter == other.filter
+            && parameters(self) == parameters(other)
     }
 }
 
 impl NeuralModel {
     /// Builds an estimator before its first frame.
     pub fn estimator(&self, shape: Shape) -> Result<NeuralEstimator> {
-        Ok(NeuralEstimator::new(&self.network, shape)?)
+        estimator(&self.network, self.filter.as_deref(), shape)
     }
 }
 
@@ -83,13 +88,31 @@ impl LearnedBelief for NeuralModel {
     }
 
     fn check_world(&self, world: &WorldForm) -> Result<()> {
-        world.check_observations(self.network.n_observations())
+        world.check_observations(self.network.n_observations())?;
+        let mut filters = self.filter.iter();
+        filters.try_for_each(|filter| filter.check_world(world))
     }
+}
+
+/// Builds an estimator before its first frame.
+///
+/// Corrections of the filter, if there is one, reach the neighbours of visited cells.
+pub fn estimator(
+    network: &NeuralBelief,
+    filter: Option<&LearnedModel>,
+    shape: Shape,
+) -> Result<NeuralEstimator> {
+    let filter = filter.map(|it| it.estimator(true, shape));
+    Ok(NeuralEstimator::new(network, filter, shape)?)
 }
 
 /// The neural belief of one world.
 pub struct NeuralEstimator {
     network: NeuralBelief,
+    /// The filter whose prediction the network corrects, if any.
+    filter: Option<Box<dyn Filter>>,
+    /// The distribution over observations that the filter predicts, shape `[O, H, W]`.
+    base: Option<Probabilities>,
     sightings: Sightings,
     /// The belief about the next observation of each cell.
     belief: Belief,
@@ -100,26 +123,42 @@ pub struct NeuralEstimator {
 }
 
 impl NeuralEstimator {
-    /// Creates the belief before the first frame.
-    pub fn new(network: &NeuralBelief, shape: Shape) -> Result<Self, NetworkError> {
+    /// Creates the belief before the first frame. `filter` is required if the network was trained to correct one.
+    pub fn new(
+        network: &NeuralBelief,
+        filter: Option<Box<dyn Filter>>,
+        shape: Shape,
+    ) -> Result<Self, NetworkError> {
         let sightings = Sightings::new(shape);
+        let base = filter.as_deref().and_then(predicted_observations);
         Ok(Self {
-            belief: belief(network.predict(&sightings)?),
+            belief: belief(network.predict(&sightings, base.as_ref())?),
             network: network.clone(),
+            filter,
+            base,
             sightings,
             likelihood: Array2::eye(network.n_observations()),
             failure: None,
         })
     }
+
+    /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by the refined filter.
+    pub fn base(&self) -> Option<&Probabilities> {
+        self.base.as_ref()
+    }
 }
 
 impl Estimator for NeuralEstimator {
     /// # Errors
-    /// If the frame is impossible under the belief, or the last prediction failed. The belief is then unchanged; after a
-    /// failure, all frames are refused until a prediction succeeds.
+    /// If the frame is impossible under this belief or the filter's, or the last prediction failed. Neither belief
+    /// changes; after a failure, all frames are refused until a prediction succeeds.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         if let Some(failure) = &self.failure {
             return Err(EstimatorError::Network(failure.clone().into()));
+        }
+        check_evidence(&self.belief, &self.likelihood, frame)?;
+        if let Some(filter) = &mut self.filter {
+            filter.correct(frame)?;
         }
         correct(&mut self.belief, &self.likelihood, frame)?;
         self.sightings.see(frame);
@@ -147,20 +186,28 @@ impl Handover for NeuralEstimator {
         let numbers = numbers.iter().flat_map(|(_, _, numbers)| numbers);
         let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
         let checksum = crc32fast::hash(&bytes);
-        format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings")
+        let filter = self.filter.as_ref();
+        let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
+        format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings{filter}")
     }
 
     fn to_bytes(&self) -> Vec<u8> {
         if self.failure.is_some() {
             return Vec::new();
         }
-        [self.belief.to_bytes(), self.sightings.to_bytes()].concat()
+        let filter = self.filter.as_ref();
+        let filter = filter.map_or(Vec::new(), |it| it.to_bytes());
+        [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()
     }
 
     fn restore(&mut self, bytes: &[u8]) -> bool {
         let dim = self.belief.probabilities().dim();
         let n_bytes = 4 * self.belief.as_slice().len();
-        let Some((belief, sightings)) = bytes.split_at_checked(n_bytes) else {
+        let Some((belief, rest)) = bytes.split_at_checked(n_bytes) else {
+            return false;
+        };
+        let n_bytes = self.sightings.to_bytes().len();
+        let Some((sightings, rest)) = rest.split_at_checked(n_bytes) else {
             return false;
         };
         let belief = Belief::from_bytes(belief, dim);
@@ -168,6 +215,11 @@ impl Handover for NeuralEstimator {
         let Some((belief, sightings)) = belief.zip(sightings) else {
             return false;
         };
+        let filter = self.filter.as_mut();
+        if !filter.map_or(rest.is_empty(), |filter| filter.restore(rest)) {
+            return false;
+        }
+        self.base = self.filter.as_deref().and_then(predicted_observations);
         (self.belief, self.sightings, self.failure) = (belief, sightings, None);
         true
     }
@@ -177,7 +229,7 @@ impl Handover for NeuralEstimator {
 fn predict_together(estimators: Vec<&mut dyn Estimator>) {
     let networks = estimators.into_iter().map(cast_mut::<NeuralEstimator>);
     let mut networks: Vec<&mut NeuralEstimator> = networks.collect();
-    networks.iter_mut().for_each(|it| it.sightings.pass());
+    in_parallel(networks.iter_mut(), |it| it.advance());
     networks.sort_by_key(|it| it.pass_key());
     for group in networks.chunk_by_mut(|a, b| a.pass_key() == b.pass_key()) {
         NeuralEstimator::predict_all(group);
@@ -185,15 +237,26 @@ fn predict_together(estimators: Vec<&mut dyn Estimator>) {
 }
 
 impl NeuralEstimator {
-    /// Returns the key by which worlds are grouped into forward passes: the network and the grid.
-    fn pass_key(&self) -> (usize, (usize, usize)) {
-        (self.network.id(), self.sightings.shape().dim())
+    /// Adds one step to the ages of all sightings, and predicts the corrected filter one step ahead.
+    fn advance(&mut self) {
+        self.sightings.pass();
+        if let Some(filter) = &mut self.filter {
+            filter.predict();
+            self.base = predicted_observations(&**filter);
+        }
+    }
+
+    /// Returns the key by which worlds are grouped into forward passes: the network, the grid, and whether the network
+    /// corrects a filter.
+    fn pass_key(&self) -> (usize, [usize; 2], bool) {
+        let (height, width) = self.sightings.shape().dim();
+        (self.network.id(), [height, width], self.base.is_some())
     }
 
     /// Runs the predictions for one group of worlds. A failure is recorded in every estimator of the group.
     fn predict_all(all: &mut [&mut Self]) {
-        let worlds: Vec<&Sightings> = all.iter().map(|it| &it.sightings).collect();
-        let predicted = all[0].network.predict_all(&worlds);
+        let worlds = all.iter().map(|it| (&it.sightings, it.base.as_ref()));
+        let predicted = all[0].network.predict_all(&worlds.collect::<Vec<_>>());
         match predicted {
             Ok(predicted) => {
                 for (estimator, probabilities) in all.iter_mut().zip(predicted) {
@@ -212,6 +275,12 @@ impl NeuralEstimator {
 fn belief(probabilities: Probabilities) -> Belief {
     let belief = Belief::from_probabilities(probabilities);
     belief.expect("invariant: a softmax is on the simplex")
+}
+
+/// Returns the distribution of each cell's next observation, `[O, H, W]`, under a belief about X_{k+1}.
+fn predicted_observations(estimator: &dyn Filter) -> Option<Probabilities> {
+    let likelihood = estimator.likelihood()?;
+    Some(observations(estimator.belief(), &likelihood))
 }
 
 #[cfg(test)]

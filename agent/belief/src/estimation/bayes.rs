@@ -1,6 +1,7 @@
 //! Bayes' rule at the cells that a frame shows (paper eqs. 5 and 10).
 
 use crate::estimation::belief::Belief;
+use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Cell, Frame};
 use ndarray::Array2;
 use thiserror::Error;
@@ -15,6 +16,23 @@ pub struct ZeroEvidence {
     pub observed: u8,
     /// The belief about the cell, one probability per state.
     pub belief: Vec<f32>,
+}
+
+/// Computes the distribution of each cell's observation under a belief, `B' u`, shape `[O, H, W]`. `likelihood` is
+/// `P(y | x)`, shape `[S, O]`.
+///
+/// # Panics
+/// If the belief and the likelihood have different numbers of states.
+pub fn observations(belief: &Belief, likelihood: &Array2<f64>) -> Probabilities {
+    let (height, width) = belief.shape().dim();
+    let (n_states, n_observations) = likelihood.dim();
+    let states = belief.view();
+    let states = states.to_shape((n_states, height * width));
+    let states = states.expect("likelihood: expected the belief's number of states");
+    let observations = likelihood.t().mapv(|p| p as f32).dot(&states);
+    let dim = (n_observations, height, width);
+    let observations = observations.into_shape_with_order(dim);
+    observations.expect("invariant: one number per observation and cell")
 }
 
 /// Applies Bayes' rule to the cells that a frame shows: `p = B(y) u / (b(y)' u)` (eq. 5). Cells that the frame does not
@@ -46,6 +64,14 @@ pub fn correct(
         cell.zip(posterior).for_each(|(to, &p)| *to = p);
     }
     Ok(())
+}
+
+/// Checks that [`correct`] accepts a frame.
+///
+/// # Errors
+/// [`ZeroEvidence`] if `b(y)' u = 0` for some cell.
+pub fn check(belief: &Belief, likelihood: &Array2<f64>, frame: &Frame) -> Result<(), ZeroEvidence> {
+    posteriors(belief, likelihood, frame).map(drop)
 }
 
 /// Returns the posterior of each observed cell, one cell after another.

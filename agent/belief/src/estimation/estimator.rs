@@ -34,6 +34,11 @@ pub trait ObservationModel {
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>>;
 }
 
+/// A filter whose prediction another estimator can refine.
+pub trait Filter: Estimator + ObservationModel + Handover {}
+
+impl<T: Estimator + ObservationModel + Handover> Filter for T {}
+
 /// An estimator whose state can be saved as bytes, and restored by another estimator of the same kind. Estimators are
 /// copied and handed over this way, too.
 pub trait Handover {

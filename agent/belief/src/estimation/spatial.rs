@@ -8,7 +8,7 @@
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{Ages, Correlations, Evidence};
-use crate::estimation::estimator::{Estimator, EstimatorError, Handover, ObservationModel};
+use crate::estimation::estimator::{Estimator, EstimatorError, Filter, Handover, ObservationModel};
 use crate::estimation::filter::BayesFilter;
 use crate::estimation::innovation::Innovation;
 use crate::estimation::spread::Spread;
@@ -31,6 +31,17 @@ pub struct SpatialFilter {
     correlations: Correlations,
     ages: Ages,
     spread: Spread,
+}
+
+/// Wraps a filter in a [`SpatialFilter`] if a state and its correlations are given.
+pub fn correcting(
+    filter: BayesFilter,
+    neighbours: Option<(usize, Correlations)>,
+) -> Box<dyn Filter> {
+    match neighbours {
+        Some((state, correlations)) => Box::new(SpatialFilter::new(filter, state, correlations)),
+        None => Box::new(filter),
+    }
 }
 
 impl SpatialFilter {

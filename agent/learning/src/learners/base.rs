@@ -33,6 +33,8 @@ pub struct LearnerKind {
     pub flags: &'static [&'static str],
     /// Returns the belief that it builds on, if any.
     pub base: fn(&AgentConfig) -> Result<Option<&'static BeliefKind>>,
+    /// Whether it needs a base.
+    pub needs_base: bool,
     /// Returns the default number of world steps of a training run. 0 means that it runs until stopped.
     pub steps: fn(&AgentConfig) -> u64,
     /// Returns the number of steps per episode in worlds that `train` simulates. `None` means endless episodes.

@@ -35,6 +35,7 @@ pub const DECISIONS: LearnerKind = LearnerKind {
     is_single: false,
     flags: &["checkpoint", "estimator"],
     base: |config| belief_of(&config.decisions.estimator).map(Some),
+    needs_base: true,
     steps: |config| config.decisions.steps,
     episode_steps: |config| Some(config.decisions.episode_steps),
     done: |contents| Ok(contents.state::<SavedDecisions>()?.world_steps),

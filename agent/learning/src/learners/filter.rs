@@ -44,6 +44,7 @@ pub const FILTER: LearnerKind = LearnerKind {
     is_single: false,
     flags: &["coverage"],
     base: |_| Ok(None),
+    needs_base: false,
     steps: |_| 0,
     episode_steps: |_| None,
     done: |contents| Ok(contents.state::<SavedFilter>()?.world_steps),

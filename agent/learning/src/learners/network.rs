@@ -35,6 +35,7 @@ pub const AUTOENCODER: LearnerKind = LearnerKind {
     is_single: true,
     flags: &[],
     base: |_| Ok(None),
+    needs_base: false,
     steps: |_| 0,
     episode_steps: |_| None,
     done: |contents| Ok(contents.state::<SavedNetwork>()?.iterations),

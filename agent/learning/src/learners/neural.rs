@@ -11,11 +11,12 @@ use self::replay::LessonReplay;
 use crate::checkpoint::{Contents, check, check_counts};
 use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
 use crate::learners::update::ModelUpdate;
-use crate::models::{SavedNeural, SavedNeuralModel};
+use crate::models::{SavedNeural, SavedNeuralModel, corrected_tensors};
 use crate::reward::{RewardEstimate, met};
 use anyhow::Result;
-use emberwatch_acting::beliefs::neural::{NeuralEstimator, NeuralModel};
-use emberwatch_acting::beliefs::{NEURAL as BELIEF, numbered_states};
+use emberwatch_acting::beliefs::learned::LearnedModel;
+use emberwatch_acting::beliefs::neural::{NeuralEstimator, NeuralModel, estimator};
+use emberwatch_acting::beliefs::{LEARNED, LearnedBelief, NEURAL as BELIEF, cast, numbered_states};
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::parallel::in_parallel;
 use emberwatch_acting::policy::Policy;
@@ -23,8 +24,8 @@ use emberwatch_acting::rollout::{
     ActingAgent, Actor, AgentObservation, StepRecord, predict_all, see_all,
 };
 use emberwatch_messages::observation::Observation;
-use emberwatch_model::Move;
 use emberwatch_model::randomness::{Purpose, stream};
+use emberwatch_model::{Move, Probabilities};
 use emberwatch_network::{Device, NeuralBelief};
 
 pub const NEURAL: LearnerKind = LearnerKind {
@@ -33,8 +34,9 @@ pub const NEURAL: LearnerKind = LearnerKind {
     checkpoint: "neural_belief",
     columns: &[],
     is_single: false,
-    flags: &[],
-    base: |_| Ok(None),
+    flags: &["checkpoint"],
+    base: |_| Ok(Some(&LEARNED)),
+    needs_base: false,
     steps: |config| config.neural.steps,
     episode_steps: |config| Some(config.neural.episode_steps),
     done: |contents| Ok(contents.state::<SavedNeural>()?.world_steps),
@@ -47,7 +49,8 @@ pub const NEURAL: LearnerKind = LearnerKind {
 };
 
 fn build(on: LearnerInputs<'_>) -> Result<Box<dyn Learner>> {
-    let learner = NeuralLearner::new(on.contents, on.worlds, on.config, on.device);
+    let filter = on.learned.get::<LearnedModel>();
+    let learner = NeuralLearner::new(on.contents, filter, on.worlds, on.config, on.device);
     Ok(Box::new(learner?))
 }
 
@@ -55,6 +58,8 @@ pub struct NeuralLearner {
     worlds: Worlds,
     config: AgentConfig,
     network: NeuralBelief,
+    /// The filter whose prediction the network corrects, if any.
+    filter: Option<Box<LearnedModel>>,
     reward: RewardEstimate,
     replay: LessonReplay,
     runs: Vec<Run>,
@@ -71,9 +76,10 @@ struct Run {
 }
 
 impl NeuralLearner {
-    /// Creates a learner, or resumes one from a checkpoint.
+    /// Creates a learner, or resumes one from a checkpoint. The network corrects the prediction of `filter`, if any.
     pub fn new(
         contents: Option<&Contents>,
+        filter: Option<&LearnedModel>,
         worlds: Worlds,
         config: &AgentConfig,
         device: &Device,
@@ -81,6 +87,7 @@ impl NeuralLearner {
         let n_observations = worlds.n_observations;
         let mut learner = Self {
             network: NeuralBelief::new(n_observations, config.seed, device)?,
+            filter: filter.cloned().map(Box::new),
             reward: RewardEstimate::new(n_observations),
             replay: LessonReplay::new(config.neural.replay_frames),
             runs: Vec::new(),
@@ -92,6 +99,8 @@ impl NeuralLearner {
         if let Some(contents) = contents {
             learner.load(contents)?;
         }
+        let mut filters = learner.filter.iter();
+        filters.try_for_each(|filter| filter.check_world(&learner.worlds.form()))?;
         Ok(learner)
     }
 
@@ -103,7 +112,8 @@ impl NeuralLearner {
 
     /// Creates a robot's agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
-        let estimator = NeuralEstimator::new(&self.network, self.worlds.shape())?;
+        let filter = self.filter.as_deref();
+        let estimator = estimator(&self.network, filter, self.worlds.shape())?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, target) = (Policy::exploiting(&BELIEF), self.paying());
         let (estimator, worlds) = (Box::new(estimator), &self.worlds);
@@ -132,6 +142,7 @@ impl NeuralLearner {
         ])?;
         contents.check_squares()?;
         saved.reward.check(expected)?;
+        self.filter = saved.model.read_filter(&contents.part(""))?;
         let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
         self.network.load(find, saved.n_updates)?;
         (self.reward, self.world_steps) = (saved.reward, saved.world_steps);
@@ -180,7 +191,8 @@ impl Actor for NeuralLearner {
             let flight = self.worlds.airspace.fly(start, &run.path);
             self.reward
                 .add(&met(belief, &flight.visited), record.reward);
-            self.replay.push(robot, &observation.frame);
+            let base = base(&run.acting);
+            self.replay.push(robot, &observation.frame, base);
         }
         let n_robots = records.len() as u64;
         self.world_steps += n_robots;
@@ -196,7 +208,9 @@ impl Actor for NeuralLearner {
 impl Learner for NeuralLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
         self.replay.start_track(robot, self.worlds.shape());
-        self.replay.push(robot, &observation.frame);
+        let filter = self.filter.as_deref();
+        let before = estimator(&self.network, filter, self.worlds.shape())?;
+        self.replay.push(robot, &observation.frame, before.base());
         let run = Run {
             acting: self.agent_at(observation)?,
             behaviour: None,
@@ -242,6 +256,7 @@ impl Learner for NeuralLearner {
     fn contents(&self) -> Result<Contents> {
         let model = NeuralModel {
             network: self.network.clone(),
+            filter: self.filter.clone(),
             target: self.paying(),
         };
         let state = SavedNeural {
@@ -250,6 +265,13 @@ impl Learner for NeuralLearner {
             n_updates: self.n_updates(),
             world_steps: self.world_steps,
         };
-        Ok(Contents::new(self.network.named_tensors()?, &state))
+        let filter = self.filter.iter().flat_map(|it| corrected_tensors(it));
+        let tensors = self.network.named_tensors()?.into_iter().chain(filter);
+        Ok(Contents::new(tensors, &state))
     }
+}
+
+/// Returns the distribution of each cell's next observation that the refined filter predicts, shape `[O, H, W]`.
+fn base(acting: &ActingAgent) -> Option<&Probabilities> {
+    cast::<NeuralEstimator>(acting.agent.estimator()).base()
 }

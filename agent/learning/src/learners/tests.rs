@@ -96,10 +96,11 @@ fn decisions_continue_from_what_was_learned() {
     let mut config = config();
     let decisions = &mut config.decisions;
     (decisions.learning.batch, decisions.updates_per_step) = (4, 1.0);
-    let neural = || {
+    let neural = |filter: Option<LearnedModel>| {
         let mut learned = Learned::default();
         learned.put(NeuralModel {
             network: NeuralBelief::new(3, 1, &Device::Cpu).expect("a network"),
+            filter: filter.map(Box::new),
             target: 1,
         });
         learned
@@ -112,7 +113,8 @@ fn decisions_continue_from_what_was_learned() {
     for (kind, learned) in [
         (&LEARNED, filter()),
         (&LEARNED_SPATIAL, filter()),
-        (&NEURAL, neural()),
+        (&NEURAL, neural(None)),
+        (&NEURAL, neural(Some(learned_filter()))),
     ] {
         let base = Base::new(kind, None, learned, worlds().shape()).expect("learned");
         let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
@@ -233,41 +235,48 @@ fn step_sizes_fall_linearly_to_their_final_value() {
     let rate = config.decisions.rate.into();
     // The columns are the loss, the step size and epsilon.
     check_rates(learner.expect("new"), rate, |update| update.more[1]);
-    let learner = NeuralLearner::new(None, worlds(), &config, &Device::Cpu);
+    let learner = NeuralLearner::new(None, None, worlds(), &config, &Device::Cpu);
     let rate = config.neural.rate;
     check_rates(learner.expect("new"), rate, |update| update.rate);
 }
 
 /// A learner of a neural belief that makes one update per step.
-fn neural(contents: Option<&Contents>, worlds: Worlds) -> anyhow::Result<NeuralLearner> {
+fn neural(
+    contents: Option<&Contents>,
+    filter: Option<&LearnedModel>,
+    worlds: Worlds,
+) -> anyhow::Result<NeuralLearner> {
     let mut config = config();
     config.neural.steps = 40;
     (config.neural.batch, config.neural.updates_per_step) = (4, 1.0);
-    NeuralLearner::new(contents, worlds, &config, &Device::Cpu)
+    NeuralLearner::new(contents, filter, worlds, &config, &Device::Cpu)
 }
 
 #[test]
 fn a_neural_belief_continues_from_what_was_learned() {
-    let mut learner = neural(None, worlds()).expect("new");
-    learner.start_episode(0, observation(0)).expect("possible");
-    let bias = |contents: &Contents| contents.tensors["head.bias"].clone();
-    let before = bias(&learner.contents().expect("whole"));
-    let left = learn(&mut learner, 1..12);
-    assert!(bias(&left) != before, "something was learned");
-    let mut resumed = neural(Some(&left), worlds()).expect("its own");
-    assert!(resumed.contents().expect("whole") == left);
-    resumed.start_episode(0, observation(12)).expect("possible");
-    learn(&mut resumed, 13..16);
-    assert_eq!((learner.n_updates(), resumed.n_updates()), (11, 14));
+    let filter = learned_filter();
+    for filter in [None, Some(&filter)] {
+        let mut learner = neural(None, filter, worlds()).expect("new");
+        learner.start_episode(0, observation(0)).expect("possible");
+        let bias = |contents: &Contents| contents.tensors["head.bias"].clone();
+        let before = bias(&learner.contents().expect("whole"));
+        let left = learn(&mut learner, 1..12);
+        assert!(bias(&left) != before, "something was learned");
+        let mut resumed = neural(Some(&left), None, worlds()).expect("its own");
+        assert!(resumed.contents().expect("whole") == left);
+        resumed.start_episode(0, observation(12)).expect("possible");
+        learn(&mut resumed, 13..16);
+        assert_eq!((learner.n_updates(), resumed.n_updates()), (11, 14));
+    }
 }
 
 #[test]
 fn errors_name_what_does_not_fit_a_neural_belief() {
-    let mut learner = neural(None, worlds()).expect("new");
+    let mut learner = neural(None, None, worlds()).expect("new");
     learner.start_episode(0, observation(0)).expect("possible");
     let left = learn(&mut learner, 1..5);
     let refused = |contents: &Contents, worlds: Worlds, words: &str| {
-        let learner = neural(Some(contents), worlds).map(drop);
+        let learner = neural(Some(contents), None, worlds).map(drop);
         let error = learner.expect_err(words).to_string();
         assert!(error.starts_with(words), "{error}");
     };

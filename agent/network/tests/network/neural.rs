@@ -8,7 +8,7 @@ use emberwatch_network::variables::{Variables, build};
 use emberwatch_network::{
     Lesson, NamedTensor, NetworkError, NeuralBelief, Operators, Sightings, UNet,
 };
-use ndarray::Axis;
+use ndarray::{Array3, Axis};
 
 fn numbers(tensor: &Tensor) -> Vec<f64> {
     let numbers = tensor
@@ -87,6 +87,7 @@ fn lessons(n: u64) -> Vec<Lesson> {
         lessons.push(Lesson {
             before: before.clone(),
             frame: frame.clone(),
+            base: Vec::new(),
         });
         for (cell, value) in frame {
             before.see_cell(cell, value);
@@ -110,7 +111,9 @@ fn one_and_more_threads_give_the_same_bits_and_so_does_a_resume() {
     let learn = |network: &mut NeuralBelief| {
         let losses = lessons.chunks(10).map(|batch| network.update(2e-3, batch));
         let losses: Vec<f64> = losses.map(|loss| loss.expect("finite")).collect();
-        let belief = network.predict(&lessons[20].before).expect("a belief");
+        let belief = network
+            .predict(&lessons[20].before, None)
+            .expect("a belief");
         (losses, belief, tensors(network))
     };
     let on = |n_threads| rayon_pool(n_threads).install(|| learn(&mut neural()));
@@ -137,18 +140,41 @@ fn on_a_device() -> NeuralBelief {
     network.expect("a network")
 }
 
+/// Returns a base distribution. In the right half of the grid, two values are equally probable, because the value that
+/// a cell shows depends on the step.
+fn base_of(cell: usize) -> [f32; 3] {
+    if cell % 18 < 9 {
+        [0.1, 0.8, 0.1]
+    } else {
+        [0.45, 0.1, 0.45]
+    }
+}
+
+fn base() -> Array3<f32> {
+    Array3::from_shape_fn((3, 21, 18), |(y, row, col)| base_of(row * 18 + col)[y])
+}
+
+/// Adds the base distribution to lessons.
+fn with_bases(mut lessons: Vec<Lesson>) -> Vec<Lesson> {
+    for lesson in &mut lessons {
+        lesson.base = lesson.frame.iter().flat_map(|it| base_of(it.0)).collect();
+    }
+    lessons
+}
+
 #[test]
 fn what_a_device_computes_is_what_we_compute() {
     let (ours, other) = (neural(), on_a_device());
-    let lessons = lessons(20);
-    let losses = [&ours, &other].map(|network| network.loss(&lessons).expect("a loss"));
-    assert!(off(&losses[1], &losses[0]) < 1e-5);
-    let gradients = losses.map(|loss| loss.backward().expect("gradients"));
-    for (name, var) in ours.variables() {
-        let of_ours = gradients[0].get(var).expect("a gradient");
-        let of_other = gradients[1].get(&other.variables()[name]);
-        let error = off(of_other.expect("a gradient"), of_ours);
-        assert!(error < 1e-4, "gradient of {name}: off by {error}");
+    for lessons in [lessons(20), with_bases(lessons(20))] {
+        let losses = [&ours, &other].map(|network| network.loss(&lessons).expect("a loss"));
+        assert!(off(&losses[1], &losses[0]) < 1e-5);
+        let gradients = losses.map(|loss| loss.backward().expect("gradients"));
+        for (name, var) in ours.variables() {
+            let of_ours = gradients[0].get(var).expect("a gradient");
+            let of_other = gradients[1].get(&other.variables()[name]);
+            let error = off(of_other.expect("a gradient"), of_ours);
+            assert!(error < 1e-4, "gradient of {name}: off by {error}");
+        }
     }
 }
 
@@ -159,35 +185,60 @@ fn worlds_are_predicted_together_as_each_alone() {
     for network in [&mut ours, &mut other] {
         network.update(2e-2, &lessons[..10]).expect("finite");
     }
-    let worlds: Vec<_> = lessons.iter().map(|it| &it.before).collect();
-    let all = ours.predict_all(&worlds).expect("beliefs");
-    let of_other = other.predict_all(&worlds).expect("beliefs");
-    for (sightings, (got, of_other)) in worlds.iter().zip(all.iter().zip(&of_other)) {
-        assert!(*got == ours.predict(sightings).expect("a belief"));
-        let differences = got.iter().zip(of_other).map(|(a, b)| (a - b).abs());
-        assert!(differences.fold(0.0, f32::max) < 1e-4);
+    let base = base();
+    for base in [None, Some(&base)] {
+        let worlds: Vec<_> = lessons.iter().map(|it| (&it.before, base)).collect();
+        let all = ours.predict_all(&worlds).expect("beliefs");
+        let of_other = other.predict_all(&worlds).expect("beliefs");
+        for ((sightings, base), (got, of_other)) in worlds.iter().zip(all.iter().zip(&of_other)) {
+            assert!(*got == ours.predict(sightings, *base).expect("a belief"));
+            let differences = got.iter().zip(of_other).map(|(a, b)| (a - b).abs());
+            assert!(differences.fold(0.0, f32::max) < 1e-4);
+        }
     }
     assert!(ours.predict_all(&[]).expect("none").is_empty());
 }
 
-#[test]
-fn it_learns() {
-    let (mut network, lessons) = (neural(), lessons(60));
+/// Trains on 50 lessons, and checks the loss of the last 10 before and after.
+fn check_learning(lessons: &[Lesson], base: Option<&Array3<f32>>, at_first: f64, n_updates: usize) {
+    let mut network = neural();
     let last = &lessons[50..];
     let loss = |network: &NeuralBelief| numbers(&network.loss(last).expect("a loss"))[0];
-    let difference = loss(&network) - 3_f64.ln();
+    let belief = |network: &NeuralBelief| {
+        let belief = network.predict(&lessons[50].before, base);
+        belief.expect("a belief")
+    };
+    let difference = loss(&network) - at_first;
     assert!(difference.abs() < 1e-5, "at first {difference}");
-    for update in 0..150 {
+    if let Some(base) = base {
+        let differences = (&belief(&network) - base).mapv(f32::abs);
+        assert!(differences.fold(0.0, |worst: f32, d| worst.max(*d)) < 1e-5);
+    }
+    for update in 0..n_updates {
         let batch = &lessons[update % 40..][..10];
         network.update(5e-3, batch).expect("finite");
     }
     // Half of the cells always show 1, and the others show one of two values. The best loss of a network that ignores
     // the step is `ln(2) / 2`.
     assert!(loss(&network) < 0.4, "{}", loss(&network));
-    let belief = network.predict(&lessons[50].before).expect("a belief");
+    let belief = belief(&network);
     assert!(belief.iter().all(|p| (1e-7..=1.0).contains(p)));
     let sums = belief.sum_axis(Axis(0));
     assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-5));
+}
+
+#[test]
+fn it_learns_alone() {
+    check_learning(&lessons(60), None, 3_f64.ln(), 150);
+}
+
+#[test]
+fn it_corrects_the_distributions_of_another() {
+    let lessons = with_bases(lessons(60));
+    let seen = || lessons[50..].iter().flat_map(|lesson| &lesson.frame);
+    let loss_at = |&(cell, value): &(usize, u8)| -f64::from(base_of(cell)[usize::from(value)]).ln();
+    let of_base = seen().map(loss_at).sum::<f64>() / seen().count() as f64;
+    check_learning(&lessons, Some(&base()), of_base, 100);
 }
 
 #[test]

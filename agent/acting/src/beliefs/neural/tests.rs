@@ -1,9 +1,11 @@
 use super::*;
+use crate::testing::learned_filter;
+use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_network::{Device, Lesson};
 
 fn estimator() -> NeuralEstimator {
     let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-    NeuralEstimator::new(&network, shape()).expect("a belief")
+    NeuralEstimator::new(&network, None, shape()).expect("a belief")
 }
 
 fn shape() -> Shape {
@@ -32,6 +34,12 @@ fn visited_cells_are_certain_until_the_next_step() {
     check(&estimator, 1, [1.0 / 3.0; 3]);
 }
 
+fn filter() -> Box<dyn Filter> {
+    let model = emberwatch_model::Model::wildfire();
+    let filter = BayesFilter::known(&model, Belief::uniform(3, shape()), false);
+    Box::new(filter.expect("a filter"))
+}
+
 #[test]
 fn predictions_together_equal_predictions_alone() {
     let networks = [1, 2].map(|seed| {
@@ -39,6 +47,7 @@ fn predictions_together_equal_predictions_alone() {
         let lesson = Lesson {
             before: Sightings::new(shape()),
             frame: vec![(0, 1), (4, 2)],
+            base: Vec::new(),
         };
         let updates = (0..3).map(|_| network.update(0.05, std::slice::from_ref(&lesson)));
         assert!(updates.into_iter().all(|loss| loss.is_ok()));
@@ -46,9 +55,10 @@ fn predictions_together_equal_predictions_alone() {
     });
     let estimators = || -> Vec<Box<dyn Estimator>> {
         let mut all = Vec::<Box<dyn Estimator>>::new();
-        // The two networks alternate.
+        // The two networks alternate, each with and without a filter to correct.
         for index in 0..8 {
-            let estimator = NeuralEstimator::new(&networks[index % 2], shape());
+            let below = (index % 4 > 1).then(filter);
+            let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());
             let mut estimator = estimator.expect("a belief");
             let seen = [255, 255, index as u8 % 3, 255, 1, 255];
             estimator.correct(&frame(&seen)).expect("possible");
@@ -67,14 +77,22 @@ fn predictions_together_equal_predictions_alone() {
 }
 
 #[test]
-fn equal_models_have_equal_targets_and_parameters() {
-    let model = |seed, target| NeuralModel {
+fn equal_models_have_equal_targets_filters_and_parameters() {
+    let model = |seed, filter: Option<LearnedModel>, target| NeuralModel {
         network: NeuralBelief::new(3, seed, &Device::Cpu).expect("a network"),
+        filter: filter.map(Box::new),
         target,
     };
-    let first = model(1, 1);
-    assert!(first == model(1, 1));
-    assert!(first != model(1, 2) && first != model(2, 1));
+    let learned = || Some(learned_filter());
+    let first = model(1, learned(), 1);
+    assert!(first == model(1, learned(), 1));
+    for other in [
+        model(1, learned(), 2),
+        model(1, None, 1),
+        model(2, learned(), 1),
+    ] {
+        assert!(first != other);
+    }
 }
 
 #[test]
@@ -89,6 +107,6 @@ fn restored_bytes_result_in_the_same_belief() {
     assert!(second.restore(&bytes));
     assert_eq!((second.to_bytes(), second.kind()), (bytes, first.kind()));
     let other = NeuralBelief::new(3, 2, &Device::Cpu).expect("a network");
-    let other = NeuralEstimator::new(&other, shape()).expect("a belief");
+    let other = NeuralEstimator::new(&other, None, shape()).expect("a belief");
     assert_ne!(other.kind(), first.kind());
 }

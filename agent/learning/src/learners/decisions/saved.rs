@@ -2,7 +2,7 @@
 
 use super::base::{Base, belief_of};
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::models::{SavedModel, SavedNeuralModel, filter_tensors};
+use crate::models::{SavedModel, SavedNeuralModel, filter_tensors, neural_tensors};
 use anyhow::{Context, Result, ensure};
 use emberwatch_acting::beliefs::learned::LearnedModel;
 use emberwatch_acting::beliefs::neural::NeuralModel;
@@ -55,7 +55,7 @@ impl SavedBelief {
             let model = learned.get::<NeuralModel>().context(NOTHING)?;
             (
                 Self::Neural(SavedNeuralModel::of(model)),
-                model.network.parameters()?,
+                neural_tensors(model)?,
             )
         } else {
             ensure!(

@@ -4,8 +4,10 @@
 //! A *block* contains consecutive frames of one robot. It stores the sightings before its first frame. The sightings
 //! before a later frame are computed from the stored sightings and the frames in between.
 
+use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, Shape};
 use emberwatch_network::{Lesson, Sightings};
+use ndarray::s;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use std::collections::{BTreeMap, VecDeque};
@@ -13,8 +15,13 @@ use std::collections::{BTreeMap, VecDeque};
 /// Maximum number of frames per block.
 const BLOCK_FRAMES: usize = 256;
 
-/// The observed cells of a frame, each with its row-major index and value.
-type SeenFrame = Vec<(usize, u8)>;
+/// A frame: its observed cells (row-major index and value), and the corrected filter's predictions for these cells,
+/// `[cells, O]`, if there is a filter.
+#[derive(Debug, Clone, PartialEq)]
+struct SeenFrame {
+    cells: Vec<(usize, u8)>,
+    base: Vec<f32>,
+}
 
 #[derive(Debug, Clone, PartialEq)]
 struct Block {
@@ -57,13 +64,23 @@ impl LessonReplay {
         }
     }
 
-    /// Adds a robot's next frame.
+    /// Adds a robot's next frame. `base` is the distribution over observations that the corrected filter predicted,
+    /// `[O, H, W]`.
     ///
     /// # Panics
     /// If the robot has no track.
-    pub fn push(&mut self, robot: u32, frame: &Frame) {
+    pub fn push(&mut self, robot: u32, frame: &Frame, base: Option<&Probabilities>) {
         let block = self.open.get_mut(&robot).expect("a track that was begun");
-        block.frames.push(frame.observed().collect());
+        let shape = block.before.shape();
+        let cells: Vec<_> = frame.observed().collect();
+        let of_cell = |base: &Probabilities, cell: usize| {
+            let at = shape.cell(cell);
+            base.slice(s![.., at.row, at.col]).to_vec()
+        };
+        let base = base.iter();
+        let base = base.flat_map(|base| cells.iter().flat_map(|it| of_cell(base, it.0)));
+        let base = base.collect();
+        block.frames.push(SeenFrame { cells, base });
         if block.frames.len() >= BLOCK_FRAMES {
             let before = block.before_frame(BLOCK_FRAMES);
             self.open(robot, before);
@@ -87,11 +104,12 @@ impl LessonReplay {
             let mut at = rng.next_u64().checked_rem(n_frames as u64)? as usize;
             for block in blocks() {
                 match block.frames.get(at) {
-                    Some(seen) if seen.is_empty() => return None,
+                    Some(seen) if seen.cells.is_empty() => return None,
                     Some(seen) => {
                         return Some(Lesson {
                             before: block.before_frame(at),
-                            frame: seen.clone(),
+                            frame: seen.cells.clone(),
+                            base: seen.base.clone(),
                         });
                     }
                     None => at -= block.frames.len(),
@@ -108,7 +126,7 @@ impl Block {
     fn before_frame(&self, at: usize) -> Sightings {
         let mut sightings = self.before.clone();
         for frame in &self.frames[..at] {
-            for &(cell, value) in frame {
+            for &(cell, value) in &frame.cells {
                 sightings.see_cell(cell, value);
             }
             sightings.pass();
@@ -136,7 +154,7 @@ mod tests {
                 if step % 10 != 9 {
                     frame.observe(robot as usize - 3, (step % 100) as u8);
                 }
-                replay.push(robot, &frame);
+                replay.push(robot, &frame, None);
             }
         }
         replay
