@@ -128,9 +128,7 @@ fn episodes_that_end_are_begun_again() {
     let rows = place.learn("whole", &format!("{} --steps 9", on(&server)));
     assert!(!rows[8][LOSS].is_empty());
     let few = place.train("few", &format!("{} --steps 2", on(&server)));
-    few.check_says(
-        "nothing was learned in 2 world steps: an update learns from a window of 4 frames",
-    );
+    few.check_says("nothing was learned in 2 world steps");
 }
 
 #[test]

@@ -246,8 +246,6 @@ fn readers_that_leave_end_programs_silently() {
         (SERVER, &format!("status {instance}")),
         (SERVER, &format!("status --json {instance}")),
         (AGENT, "train --help"),
-        (AGENT, "compare --policies help"),
-        (AGENT, "suite --policies help"),
         (AGENT, &format!("compare {TINY}")),
         ("emberwatch-dashboard", "--version"),
     ] {

@@ -58,7 +58,7 @@ fn a_neural_belief_corrects_a_filter_and_decisions_learn_on_it() {
     place.refuse(
         "out",
         &again,
-        "--checkpoint cannot be combined with --resume",
+        "--resume | cannot be used with | --checkpoint",
     );
     place.learn("out", &format!("{WORLDS} --resume"));
     let policies = "--policies neural_beam --baseline neural_beam";

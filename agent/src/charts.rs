@@ -7,5 +7,5 @@ mod lines;
 mod page;
 
 pub use self::ladder::{Bar, Ladder};
-pub use self::lines::{Curve, Lines, MAX_CURVES, Panel, Point, Scale, Shade};
+pub use self::lines::{Curve, Lines, MAX_CURVES, Panel, Point, Scale};
 pub use plotters::style::RGBColor;

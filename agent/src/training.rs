@@ -46,13 +46,9 @@ pub struct TrainSummary {
     /// Number of updates, including earlier runs that this run resumes.
     pub updates: u64,
     pub reward: f64,
-    /// Time spent on planning paths.
-    pub planning: Duration,
-    /// Time spent on updates.
-    pub learning: Duration,
 }
 
-/// Trains until the steps are done, the deadline has passed or `stop` is set. Always saves at the end.
+/// Trains until the steps are done or `stop` is set. Always saves at the end.
 /// `contents` is the result of [`TrainingSpec::check`].
 pub fn train(
     worlds: &mut Worlds,
@@ -157,14 +153,11 @@ impl<'a> TrainingLoop<'a> {
     }
 
     fn act(&mut self, spec: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
-        let is_over = || spec.deadline.is_some_and(|end| Instant::now() >= end);
         let is_done = |steps: u64| spec.steps > 0 && steps >= spec.steps;
-        while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
+        while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) {
             let tick = self.step();
             let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
-            let start = Instant::now();
             let updates = self.learner.learn();
-            self.summary.learning += start.elapsed();
             let mut updates = updates.map_err(|problem| spec.stopped(problem, &*self.learner))?;
             self.summary.updates = self.learner.n_updates();
             if updates.is_empty() {
@@ -187,7 +180,6 @@ impl<'a> TrainingLoop<'a> {
         let mut shown = ShownLearner::new(learner, self.kind, &mut self.feed, &self.client);
         let mut served = Served::new(&mut self.client, shows_all);
         let records = rollout::step(&mut shown, &mut served)?.unwrap_or_default();
-        self.summary.planning += shown.planning;
         let tick = Tick::of(&records, self.learner.world_steps());
         let robots = self.client.robots();
         let present = (0..robots.len()).map(|index| self.learner.agent(index).observation());
@@ -217,8 +209,10 @@ impl<'a> TrainingLoop<'a> {
     fn warn_of_no_update(&self) {
         let steps = self.summary.steps;
         if steps > 0 && self.learner.n_updates() == self.n_before {
-            let cause = self.learner.lacks(steps);
-            tracing::warn!("nothing was learned in {steps} world steps: {cause}");
+            tracing::warn!(
+                "nothing was learned in {steps} world steps: train for more --steps, on longer episodes, or with \
+                 smaller settings of the learner (batch, window, streams)"
+            );
         }
     }
 

@@ -4,7 +4,6 @@
 
 pub mod autoencoder;
 pub mod first_belief;
-mod follower;
 mod kind;
 mod known;
 pub mod learned;
@@ -18,7 +17,7 @@ pub use self::kind::{
 };
 pub use self::known::{KNOWN, KNOWN_CAVITIES, KNOWN_SPATIAL, KNOWN_SPATIAL_CAVITIES};
 pub use self::learned::{LEARNED, LEARNED_SPATIAL};
-pub use self::neural::{NEURAL, NEURAL_SENSOR};
+pub use self::neural::NEURAL;
 pub use self::truth::{NONE, TRUTH};
 pub use self::world_form::WorldForm;
 use emberwatch_model::text::shortened;
@@ -36,7 +35,6 @@ pub const BELIEFS: &[&BeliefKind] = &[
     &LEARNED,
     &LEARNED_SPATIAL,
     &NEURAL,
-    &NEURAL_SENSOR,
     &AUTOENCODER,
     &TRUTH,
 ];
@@ -126,14 +124,11 @@ mod tests {
         let knowing = BELIEFS
             .iter()
             .filter(|kind| kind.knows_model && kind.input == Input::Frames);
-        let neural = [&NEURAL, &NEURAL_SENSOR];
         for kind in knowing.copied().filter(|kind| kind.learned_by.is_none()) {
             refuses(kind, None);
         }
-        for kind in neural {
-            refuses(kind, None);
-            refuses(kind, Some(learned_filter()));
-        }
+        refuses(&NEURAL, None);
+        refuses(&NEURAL, Some(learned_filter()));
     }
 
     #[test]

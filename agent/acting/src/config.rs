@@ -3,12 +3,11 @@
 mod sections;
 
 pub use sections::{
-    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, NeuralConfig,
-    ObjectiveConfig, StepSize,
+    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, NeuralConfig, StepSize,
 };
 
 use self::sections::check;
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Result, anyhow, bail, ensure};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::Integration;
 use emberwatch_model::text::parse_problem;
@@ -28,6 +27,18 @@ autoencoder.step_size.power = 0.0
 dqn.step_size.power = 0.0
 "#;
 
+/// Settings of earlier versions that are constant now, with their values in TOML. Checkpoints may contain them.
+const CONSTANTS: [(&str, &str); 8] = [
+    ("objective.shooting_bonus", "1.0"),
+    ("objective.beam_bonus", "0.02"),
+    ("objective.entropy", "\"mean\""),
+    ("objective.belief", "\"predictor\""),
+    ("learning.beta1", "0.9"),
+    ("learning.beta2", "0.99"),
+    ("learning.anchor", "0.001"),
+    ("autoencoder.betas", "[0.5, 0.9]"),
+];
+
 /// Settings of planners and estimators. `config/agent.toml` explains each of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AgentConfig {
@@ -40,7 +51,6 @@ pub struct AgentConfig {
     /// The name of the learner that `train` uses.
     pub learner: String,
     pub full_frames: bool,
-    pub objective: ObjectiveConfig,
     pub learning: LearningConfig,
     pub neural: NeuralConfig,
     pub autoencoder: AutoencoderConfig,
@@ -98,7 +108,6 @@ impl AgentConfig {
             ("prior_worlds", self.prior_worlds as f64, 1.0, 1e4),
         ];
         check("", &ranges)?;
-        self.objective.check()?;
         self.learning.check()?;
         self.neural.check()?;
         self.autoencoder.check()?;
@@ -128,12 +137,26 @@ impl AgentConfig {
 fn replace(settings: &mut Table, by: Table, section: &str) -> Result<()> {
     for (name, value) in by {
         match (settings.get_mut(&name), value) {
-            (None, _) => bail!("{section}{name}: expected a known setting"),
+            (None, Value::Table(by)) => {
+                replace(&mut Table::new(), by, &format!("{section}{name}."))?;
+            }
+            (None, value) => check_constant(&format!("{section}{name}"), &value.to_string())?,
             (Some(Value::Table(settings)), Value::Table(by)) => {
                 replace(settings, by, &format!("{section}{name}."))?;
             }
             (Some(setting), value) => *setting = value,
         }
+    }
+    Ok(())
+}
+
+fn check_constant(name: &str, got: &str) -> Result<()> {
+    match CONSTANTS.iter().find(|constant| constant.0 == name) {
+        Some((_, expected)) => ensure!(
+            got == *expected,
+            "{name}: expected {expected}, which is constant, got {got}"
+        ),
+        None => bail!("{name}: expected a known setting"),
     }
     Ok(())
 }
@@ -170,11 +193,9 @@ mod tests {
     fn errors_name_invalid_settings() {
         for (settings, expected) in [
             ("beam_width = 0", "1 to 10000, got 0"),
-            ("objective.beam_bonus = nan", "0 to 1000, got NaN"),
             ("learning.streams = 0", "1 to 1024, got 0"),
             ("learning.states = 1", "2 to 64, got 1"),
             ("learning.rate = nan", "0 to 1, got NaN"),
-            ("learning.beta1 = 1.0", "0 to 0.999999, got 1"),
             ("neural.batch = 0", "1 to 1024, got 0"),
             ("neural.rate = nan", "0 to 1, got NaN"),
             ("autoencoder.replay_frames = 999", "1000 to 100000, got 999"),
@@ -190,11 +211,10 @@ mod tests {
             let name = settings.split(" = ").next().unwrap_or_default();
             assert_eq!(error.to_string(), format!("{name}: expected {expected}"));
         }
-        let error =
-            AgentConfig::from_toml("objective.belief = 'prior'").expect_err("no such belief");
-        assert!(
-            error.to_string().contains("`predictor` or `estimate`"),
-            "{error}"
-        );
+        let old = "objective.belief = 'predictor'\nautoencoder.betas = [0.5, 0.9]\nobjective.beam_bonus = 0.02";
+        AgentConfig::from_toml(old).expect("constants");
+        let error = AgentConfig::from_toml("objective.belief = 'estimate'").expect_err("constant");
+        let words = "objective.belief: expected \"predictor\", which is constant, got \"estimate\"";
+        assert_eq!(error.to_string(), words);
     }
 }

@@ -3,13 +3,13 @@
 use emberwatch_model::Model;
 use serde::{Deserialize, Serialize};
 use std::any::Any;
-use std::fmt::{self, Debug};
+use std::fmt;
 use std::sync::Arc;
 
 /// Values from checkpoints, for the beliefs and goals that use them. Clones share the values.
-#[derive(Debug, Clone, Default)]
+#[derive(Clone, Default)]
 pub struct Learned {
-    values: Vec<Arc<dyn Value>>,
+    values: Vec<Arc<dyn Any + Send + Sync>>,
     /// The worlds in which each checkpoint was learned.
     pub worlds: Vec<WorldNames>,
 }
@@ -49,27 +49,11 @@ impl fmt::Display for WorldNames {
     }
 }
 
-trait Value: Any + Debug + Send + Sync {}
-
-impl<T: Any + Debug + Send + Sync> Value for T {}
-
 impl Learned {
     /// Returns the value of type `T`, if a checkpoint contained one.
     pub fn get<T: Any>(&self) -> Option<&T> {
         let mut values = self.values.iter();
-        values.find_map(|value| {
-            let value: &dyn Any = &**value;
-            value.downcast_ref()
-        })
-    }
-
-    /// Returns the same value as [`Self::get`], with shared ownership.
-    pub fn shared<T: Any + Send + Sync>(&self) -> Option<Arc<T>> {
-        let mut values = self.values.iter();
-        values.find_map(|value| {
-            let value: Arc<dyn Any + Send + Sync> = value.clone();
-            value.downcast().ok()
-        })
+        values.find_map(|value| value.downcast_ref())
     }
 
     /// Returns a warning if a checkpoint was learned in worlds of another name than these.
@@ -81,12 +65,9 @@ impl Learned {
     }
 
     /// Stores a value, and drops any earlier value of the same type. Returns whether the dropped value was different.
-    pub fn put<T: Any + Debug + Send + Sync + PartialEq>(&mut self, value: T) -> bool {
+    pub fn put<T: Any + Send + Sync + PartialEq>(&mut self, value: T) -> bool {
         let is_other = self.get::<T>().is_some_and(|before| *before != value);
-        self.values.retain(|before| {
-            let before: &dyn Any = &**before;
-            !before.is::<T>()
-        });
+        self.values.retain(|before| !before.is::<T>());
         self.values.push(Arc::new(value));
         is_other
     }

@@ -11,7 +11,7 @@ mod planners;
 pub use self::decisions::LearnedDecisions;
 pub use self::goals::{GOALS, Goal, GoalEntry};
 pub use self::help::help;
-pub use self::ladder::{ladder, options_table};
+pub use self::ladder::ladder;
 pub use self::names::{check_name, planner_of};
 pub use self::parts::{Policy, network_choices};
 pub use self::planners::{AHEAD, BEAM, BY_OPTIONS, PLANNERS, PlannerKind, RANDOM, SHOOTING};

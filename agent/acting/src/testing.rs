@@ -5,22 +5,20 @@ use crate::beliefs::learned::LearnedModel;
 use crate::config::AgentConfig;
 use emberwatch_belief::estimation::Correlations;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::Shape;
 use emberwatch_network::{Autoencoder, Device, Dqn, DqnSettings, DqnShape, NetworkShape};
+use std::sync::Arc;
 
 pub fn shape() -> Shape {
     Shape::new(8, 9).expect("test shape")
 }
 
-pub fn config(belief: BasisKind) -> AgentConfig {
-    let mut config = AgentConfig {
+pub fn config() -> AgentConfig {
+    AgentConfig {
         beam_width: 8,
         shooting_samples: 64,
         ..AgentConfig::default()
-    };
-    config.objective.belief = belief;
-    config
+    }
 }
 
 /// A filter with its initial parameters.
@@ -35,8 +33,8 @@ pub fn learned_filter() -> LearnedModel {
 }
 
 /// An untrained network. The seed of its DQN is the lowest seed with which the DQN satisfies the condition `suits`.
-pub fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
-    let settings = config(basis).autoencoder.settings();
+pub fn network(suits: impl Fn(&Dqn) -> bool) -> AutoencoderModel {
+    let settings = config().autoencoder.settings();
     let shape = NetworkShape {
         grid: shape(),
         n_states: 3,
@@ -49,8 +47,7 @@ pub fn network(basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> AutoencoderMod
     let dqn = |seed| Dqn::new(DqnSettings::paper(), actions, seed);
     AutoencoderModel {
         autoencoder,
-        dqn: (0..1000).map(dqn).find(suits).expect("a seed that suits"),
-        basis,
+        dqn: Arc::new((0..1000).map(dqn).find(suits).expect("a seed that suits")),
         target: 2,
     }
 }

@@ -4,7 +4,7 @@
 //! update.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
 use emberwatch_belief::planning::team::{ROUNDS, plan_team};
 use emberwatch_belief::planning::{
@@ -117,9 +117,7 @@ fn estimators(c: &mut Criterion) {
             b.iter(|| advance(estimator, black_box(frames.next().expect("endless"))));
         });
     }
-    c.bench_function("entropy", |b| {
-        b.iter(|| filter.belief().entropy(EntropyKind::Sum))
-    });
+    c.bench_function("entropy", |b| b.iter(|| filter.belief().entropy()));
 }
 
 /// The prediction by hazards, without and with cavities.

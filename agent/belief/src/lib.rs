@@ -14,6 +14,6 @@ pub mod estimation;
 pub mod merit;
 pub mod planning;
 
-pub use estimation::belief::{Belief, BeliefError, EntropyKind};
+pub use estimation::belief::{Belief, BeliefError};
 pub use estimation::{BayesFilter, Estimator, EstimatorError, SpatialFilter};
 pub use planning::{Objective, Plan, Planner, PlanningProblem};

@@ -18,7 +18,7 @@ pub mod value_layers;
 pub use ahead::Ahead;
 pub use beam::BeamSearch;
 pub use memory::Memory;
-pub use objective::{BasisKind, CellValues, Objective, Target};
+pub use objective::{CellValues, Objective, Target};
 pub use options::{OPTIONS, OptionPlanner, PathOption, Proposal};
 pub use planner::{Plan, Planner, PlanningProblem};
 pub use random_walk::RandomWalk;

@@ -11,10 +11,9 @@ use crate::operator::Operator;
 use emberwatch_belief::estimation::parameters::Tables;
 use emberwatch_model::Shape;
 use pulp::{Arch, Simd, WithSimd};
-use serde::{Deserialize, Serialize};
 
 /// The observation of one cell in a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sighting {
     /// Index of the cell in the grid, row by row.
     pub cell: u32,

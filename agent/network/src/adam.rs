@@ -1,11 +1,10 @@
 //! The Adam optimiser for candle variables, equivalent to PyTorch's, with moments that can be saved.
 
 use crate::error::{NetworkError, NotFinite};
-use crate::tensors::{Change, copied, named, set, zero_if_finite};
+use crate::tensors::{Change, copied, set, zero_if_finite};
 use crate::variables::{Variables, is_statistic};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
-use serde::{Deserialize, Serialize};
 
 /// A constant that is added to moments and subtracted again. Because of rounding, moments whose gradients stay zero
 /// then stop decaying at a few rounding errors of this constant. Moments therefore never become subnormal numbers,
@@ -13,8 +12,7 @@ use serde::{Deserialize, Serialize};
 const FLUSH: f64 = 1e-30;
 
 /// Settings of Adam.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamSettings {
     /// The learning rate.
     pub learning_rate: f32,
@@ -64,8 +62,7 @@ impl Adam {
     /// Performs one optimisation step on a loss, and returns the loss.
     ///
     /// # Errors
-    /// [`NetworkError`] if a value is not finite. The error names the first tensor that contains one, in the order of
-    /// computation. All variables are then unchanged.
+    /// [`NetworkError`] if the loss or a new value is not finite. All variables are then unchanged.
     pub fn update(
         &mut self,
         settings: &AdamSettings,
@@ -84,43 +81,24 @@ impl Adam {
         prefix: &'static str,
     ) -> std::result::Result<f32, NetworkError> {
         let gradients = loss.backward()?;
-        let groups = [(prefix, &self.variables)];
-        let of_variables = named(&groups).zip(self.variables.values());
-        let of_variables = of_variables.filter_map(|((name, _), var)| {
-            let gradient = gradients.get(var)?;
-            Some((format!("gradient of {name}"), gradient))
-        });
         let mut changes = statistics;
         changes.extend(self.changes(settings, &gradients)?);
         let after = changes.iter();
         let after = after.map(|(name, _, tensor)| (format!("{prefix}{name}"), tensor));
-        // List tensors in the order of computation, so that the error names the first one that is not finite.
-        let all = named(&groups).chain(of_variables);
-        let all: Vec<_> = all.chain([("loss".into(), loss)]).chain(after).collect();
-        let loss = self.checked(&all, loss)?;
+        let all: Vec<_> = [("loss".into(), loss)].into_iter().chain(after).collect();
+        let zeros = all.iter().map(|(_, tensor)| zero_if_finite(tensor));
+        let numbers = copied(
+            &zeros
+                .chain([Ok(loss.clone())])
+                .collect::<Result<Vec<_>>>()?,
+        )?;
+        let mut zeros = all.iter().zip(&numbers);
+        if let Some(((name, _), _)) = zeros.find(|(_, zero)| **zero != 0.0) {
+            return Err(self.not_finite(name.clone()));
+        }
         set(&changes)?;
         self.steps += 1;
-        Ok(loss)
-    }
-
-    /// Checks that all values of the given tensors are finite. Returns the value of `scalar`, which is copied from the
-    /// device together with the results of the checks.
-    ///
-    /// # Errors
-    /// [`NetworkError`] that names the first tensor with a value that is not finite.
-    pub(crate) fn checked(
-        &self,
-        tensors: &[(String, &Tensor)],
-        scalar: &Tensor,
-    ) -> std::result::Result<f32, NetworkError> {
-        let zeros = tensors.iter().map(|(_, tensor)| zero_if_finite(tensor));
-        let numbers = zeros.chain([Ok(scalar.clone())]);
-        let numbers = copied(&numbers.collect::<Result<Vec<_>>>()?)?;
-        let first = tensors.iter().zip(&numbers).find(|(_, zero)| **zero != 0.0);
-        match first {
-            Some(((name, _), _)) => Err(self.not_finite(name.clone())),
-            None => Ok(numbers[tensors.len()]),
-        }
+        Ok(numbers[all.len()])
     }
 
     pub(crate) fn not_finite(&self, tensor: String) -> NetworkError {

@@ -15,13 +15,10 @@ use crate::window::Window;
 use candle_core::{DType, Device, Tensor};
 use emberwatch_model::grid::Probabilities;
 use emberwatch_model::randomness::{Purpose, stream};
-use serde::{Deserialize, Serialize};
-use std::fmt;
 use std::sync::Arc;
 
 /// Settings of the autoencoder.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AutoencoderSettings {
     /// Length of the encoder's output.
     pub encoding: usize,
@@ -226,14 +223,5 @@ impl Autoencoder {
         self.adam.set_steps(steps);
         self.n_updates = n_updates;
         Ok(())
-    }
-}
-
-impl fmt::Debug for Autoencoder {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut debug = f.debug_struct("Autoencoder");
-        debug.field("shape", &self.shape);
-        debug.field("n_updates", &self.n_updates);
-        debug.finish_non_exhaustive()
     }
 }

@@ -2,15 +2,14 @@
 //! (section III.E). The crate also has a neural belief, which minimises the same loss but works on the grid itself
 //! instead of on a hidden vector.
 //!
-//! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`] (its
+//! In reading order: [`Network`] (the model: encoder, GRU, decoder, observation matrix), [`Autoencoder`] (its
 //! updates and steps), [`Adam`], [`Dqn`]; [`Sightings`], [`UNet`], [`NeuralBelief`].
 //!
 //! Layers create their variables through a `VarBuilder` from [`variables`], and candle's `backward()` computes all
 //! gradients. Encoder, recurrence, decoder and U-Net each have two implementations: our operators with hand-written
 //! kernels and gradients (`ops`), and candle's stock operators, which also run on GPUs.
 //!
-//! To add a layer, create it in `Network::new` and call it in `Network::forward`. `examples/second_gru.rs` shows how to
-//! add a layer outside this crate.
+//! To add a layer, create it in `Network::new` and call it in `Network::forward`.
 
 mod adam;
 mod autoencoder;
@@ -40,16 +39,12 @@ mod window;
 pub use adam::{Adam, AdamSettings};
 pub use autoencoder::{Autoencoder, AutoencoderSettings};
 pub use candle_core::{Device, utils::barrier_pool};
-pub use decoder::Decoder;
-pub use device::{DeviceError, DeviceKind};
+pub use device::{DEVICES, open_device};
 pub use dqn::{Dqn, DqnSettings, DqnShape, Track, Transition};
 pub use dropout::{Dropout, Mask};
-pub use encoder::Encoder;
 pub use error::{NetworkError, NotFinite};
-pub use gru::Gru;
 pub use model::Network;
 pub use neural::{Lesson, NeuralBelief};
-pub use observation_matrix::ObservationMatrix;
 pub use operators::Operators;
 pub use pass::Pass;
 pub use replay::FrameReplay;

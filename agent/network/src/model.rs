@@ -7,7 +7,6 @@ use crate::observation_matrix::ObservationMatrix;
 use crate::operators::Operators;
 use crate::pass::Pass;
 use crate::shape::NetworkShape;
-use crate::variables::count_numbers;
 use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 use candle_nn::ops::softmax;
@@ -55,37 +54,5 @@ impl Network {
     /// Returns the observation matrix `O`, `[observations, states]`. Each column sums to one.
     pub fn observation_matrix(&self) -> Result<Tensor> {
         self.observation.matrix()
-    }
-}
-
-impl NetworkShape {
-    /// Counts the values in the network's parameters and statistics without allocating them.
-    pub fn n_numbers(&self) -> usize {
-        count_numbers(|vb| Network::new(&vb, self, Operators::Own))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use emberwatch_model::Shape;
-
-    #[test]
-    fn all_parameters_and_statistics_are_counted() {
-        // The convolutions have 6,176 + 8,208 + 1,160 numbers, the linear layer 516, the GRU 120, the decoder 8,192 +
-        // 131,072 + 32,768 + 8,192 + 768, the observation matrix 9, and the seven normalisations four for each of their
-        // 296 channels.
-        assert_eq!(shape(64).n_numbers(), 197_181 + 4 * 296);
-        assert!(shape(4096).n_numbers() > 40_000_000);
-    }
-
-    fn shape(side: usize) -> NetworkShape {
-        NetworkShape {
-            grid: Shape::new(side, side).expect("test shape"),
-            n_states: 3,
-            n_observations: 3,
-            encoding: 4,
-            hidden: 4,
-        }
     }
 }

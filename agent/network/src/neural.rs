@@ -16,7 +16,6 @@ use candle_core::{D, DType, Device, Result as CandleResult, Shape, Tensor};
 use candle_nn::ops::{log_softmax, softmax};
 use emberwatch_model::grid::Probabilities;
 use rayon::prelude::*;
-use std::fmt;
 use std::sync::Arc;
 
 /// Settings of Adam: PyTorch's default decay rates, and the norm at which gradients are clipped. Each update sets the
@@ -370,14 +369,5 @@ impl NeuralBelief {
 impl Lesson {
     fn cells(&self) -> impl Iterator<Item = usize> {
         self.frame.iter().map(|(cell, _)| *cell)
-    }
-}
-
-impl fmt::Debug for NeuralBelief {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut debug = f.debug_struct("NeuralBelief");
-        debug.field("n_observations", &self.n_observations);
-        debug.field("n_updates", &self.n_updates());
-        debug.finish_non_exhaustive()
     }
 }

@@ -66,6 +66,16 @@ impl NetworkShape {
         self.seed().map(|side| side * SEED_CELL)
     }
 
+    /// Returns the names and shapes of the tensors whose size depends on the grid.
+    pub fn grid_tensors(&self) -> [(&'static str, Vec<usize>); 2] {
+        let [rows, cols] = self.seed();
+        let seed = vec![self.hidden, DECODER_CHANNELS[0], rows, cols];
+        [
+            ("decoder.0.weight", seed),
+            ("encoder.13.weight", vec![self.encoding, self.features()]),
+        ]
+    }
+
     /// Returns the encoder's convolutions.
     pub fn convolutions(&self) -> [ConvShape; 3] {
         let (mut input, mut channels_in) = (self.padded(), self.n_observations);

@@ -5,7 +5,7 @@ use clap::ValueEnum;
 /// Label of a team whose robots ignore each other, and of a single robot.
 pub const ALONE: &str = "alone";
 
-/// How the robots of a world act together. With one robot, all kinds but [`Self::Oracle`] are the same.
+/// How the robots of a world act together. With one robot, all kinds are the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Team {
     /// Each robot plans on its own observations, as if there were no other robots
@@ -14,8 +14,6 @@ pub enum Team {
     Shared,
     /// One agent plans for all robots, on one belief
     Joint,
-    /// One agent plans for all robots on the true states, whatever --policies says; only in comparisons
-    Oracle,
 }
 
 impl Team {
@@ -24,7 +22,6 @@ impl Team {
             Self::Alone => ALONE,
             Self::Shared => "shared",
             Self::Joint => "joint",
-            Self::Oracle => "oracle",
         }
     }
 }

@@ -20,15 +20,12 @@ use emberwatch_acting::rollout::{
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::Plan;
 use emberwatch_belief::planning::team::robot_seed;
+use emberwatch_protocol::Move;
 use emberwatch_protocol::feed::Feed;
-use emberwatch_protocol::{Model, Move};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// The policy of [`Team::Oracle`].
-const ORACLE: &str = "oracle_beam";
-
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Comparison {
     /// The policies, in the order of the table.
     pub policies: Vec<Policy>,
@@ -39,38 +36,29 @@ pub struct Comparison {
     pub config: AgentConfig,
     /// Learned models, for policies that use them.
     pub learned: Learned,
-    /// Whether known-model beliefs start from each world's hidden state.
-    pub first_state_known: bool,
 }
 
-#[derive(Debug, Default)]
-pub struct Results {
-    /// One run per policy, team and world, in the order of the policies.
-    pub runs: Vec<PolicyRun>,
-    /// Number of cells in the state with the highest reward, per step, averaged over worlds. The same for all policies.
-    pub fire_cells: Vec<f32>,
-}
-
-/// Runs every policy on every world. Calls `progress` with a policy's name and the number of world steps just made.
+/// Runs every policy on every world. Returns one run per policy, team and world, in the order of the policies. Calls
+/// `progress` with a policy's name and the number of world steps just made.
 pub fn compare(
     worlds: &mut ComparedWorlds,
     comparison: &Comparison,
     progress: &mut dyn FnMut(&str, u64),
-) -> Result<Results> {
+) -> Result<Vec<PolicyRun>> {
     let config = &comparison.config;
     let prior = config.prior(worlds.info().burn_in);
     let prior = first_belief(prior, worlds.known_model(), worlds.shape(), config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     warn_of_other_worlds(&comparison.learned, worlds.info());
-    let mut results = Results::default();
+    let mut runs = Vec::new();
     let mut feed = worlds.feed(prior.probabilities());
-    let entries = comparison.entries(&worlds.model);
+    let entries = comparison.entries();
     // Before other policies run for hours, refuse any policy that cannot run.
     for (policy, _) in &entries {
         let checked = comparison.check(policy, worlds);
         checked.with_context(|| format!("policy {:?}", policy.name))?;
     }
-    for (index, (policy, team)) in entries.iter().enumerate() {
+    for (policy, team) in &entries {
         worlds.set_team(*team);
         for batch in seeds.chunks(worlds.n_worlds as usize) {
             let started = comparison.start(policy, &prior, worlds, batch, &mut feed);
@@ -82,16 +70,12 @@ pub fn compare(
                 Ok(agents.tallies)
             });
             let tallies = played.with_context(|| format!("policy {:?}", policy.name))?;
-            if index == 0 {
-                results.add_fire(1.0 / seeds.len() as f32, &tallies);
-            }
-            let runs = tallies.into_iter();
-            let runs = runs.map(|tally| tally.into_run(policy, *team, worlds.info()));
-            results.runs.extend(runs);
+            let tallies = tallies.into_iter();
+            runs.extend(tallies.map(|tally| tally.into_run(policy, *team, worlds.info())));
         }
     }
     feed.end();
-    Ok(results)
+    Ok(runs)
 }
 
 impl Comparison {
@@ -101,24 +85,18 @@ impl Comparison {
         self.seeds.clone().map(world).collect()
     }
 
-    /// Returns each policy with each kind of team, but the oracle team only once.
-    pub fn entries(&self, model: &Model) -> Vec<(Policy, Team)> {
-        let mut entries = Vec::new();
-        for &team in &self.teams {
-            let oracle = Policy::named(ORACLE, model).expect("invariant: every model has it");
-            match team {
-                Team::Oracle => entries.push((oracle, team)),
-                _ => entries.extend(self.policies.iter().map(|it| (it.clone(), team))),
-            }
-        }
-        entries
+    /// Returns each policy with each kind of team.
+    pub fn entries(&self) -> Vec<(Policy, Team)> {
+        let teams = self.teams.iter();
+        let entries =
+            teams.flat_map(|&team| self.policies.iter().map(move |it| (it.clone(), team)));
+        entries.collect()
     }
 
     /// Checks that a policy can act in the worlds.
     fn check(&self, policy: &Policy, worlds: &mut ComparedWorlds) -> Result<()> {
-        let needs_truth = policy.belief.input == Input::States || self.first_state_known;
         ensure!(
-            worlds.has_truth() || !needs_truth,
+            worlds.has_truth() || policy.belief.input != Input::States,
             "it needs the truth channel: start the server with --publish-truth"
         );
         worlds.check_model(policy)?;
@@ -140,15 +118,10 @@ impl Comparison {
         let mut agents = Vec::new();
         for (index, seen) in seen.into_iter().enumerate() {
             let (seed, number) = (seeds[index / n_agents], index % n_agents);
-            // If the first state is known, the belief is certain.
-            let known = seen.truth.as_ref().filter(|_| self.first_state_known);
-            let n_states = worlds.known_model().n_states();
-            let certain = known.map(|states| Belief::from_states(states, n_states));
-            let certain = certain.transpose()?;
             let conditions = Conditions {
                 model: Some(worlds.known_model()),
                 shape: worlds.shape(),
-                prior: Some(certain.as_ref().unwrap_or(prior)),
+                prior: Some(prior),
                 learned: &self.learned,
             };
             let seed = robot_seed(self.config.planner_seed(seed), number);
@@ -165,16 +138,6 @@ impl Comparison {
             n_robots,
             feed,
         })
-    }
-}
-
-impl Results {
-    fn add_fire(&mut self, share: f32, tallies: &[RunTally]) {
-        for cells in tallies.iter().map(|tally| &tally.fire_cells) {
-            self.fire_cells.resize(cells.len(), 0.0);
-            let both = self.fire_cells.iter_mut().zip(cells);
-            both.for_each(|(mean, cells)| *mean += share * cells);
-        }
     }
 }
 

@@ -113,7 +113,7 @@ impl ComparedWorlds {
     /// Sets the kind of team for the following flights.
     pub fn set_team(&mut self, team: Team) {
         self.robots_per_agent = match team {
-            Team::Joint | Team::Oracle => self.n_robots(),
+            Team::Joint => self.n_robots(),
             Team::Alone | Team::Shared => 1,
         };
         // With one robot per world, sharing frames changes nothing.

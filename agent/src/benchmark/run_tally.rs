@@ -19,8 +19,8 @@ pub struct RunTally {
     seed: u64,
     /// The state with the highest reward.
     target: usize,
-    /// Number of cells in that state, at each step.
-    pub fire_cells: Vec<f32>,
+    /// Number of cells in that state, summed over steps.
+    fire_cells: f64,
     rewards: Vec<f32>,
     reward: f64,
     n_visited: u64,
@@ -42,7 +42,7 @@ impl RunTally {
         Self {
             seed,
             target,
-            fire_cells: Vec::new(),
+            fire_cells: 0.0,
             rewards: Vec::new(),
             reward: 0.0,
             n_visited: 0,
@@ -85,7 +85,7 @@ impl RunTally {
     pub fn score(&mut self, acting: &ActingAgent, score: Option<Score>) {
         let (agent, result) = (&acting.agent, &acting.observation().world);
         self.rewards.push(result.reward as f32);
-        self.fire_cells.push(result.n_target_cells as f32);
+        self.fire_cells += f64::from(result.n_target_cells);
         self.reward += result.reward;
         self.n_visited += u64::from(result.n_visited);
         self.n_hits += u64::from(result.n_hits);
@@ -110,7 +110,7 @@ impl RunTally {
             mean_reward: mean(self.reward),
             mean_distinct_cells: mean(self.n_visited as f64),
             hit_rate: share(self.n_hits, self.n_visited),
-            mean_fire_cells: mean(self.fire_cells.iter().copied().map(f64::from).sum()),
+            mean_fire_cells: mean(self.fire_cells),
             mean_plan_millis: mean(self.planning.as_secs_f64() * 1e3),
             brier: brier.map(mean),
             moves: info.n_moves,

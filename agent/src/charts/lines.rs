@@ -25,9 +25,6 @@ const COLORS: [RGBColor; MAX_CURVES] = [
 /// Maximum number of curves per panel: the number of colours.
 pub const MAX_CURVES: usize = 8;
 
-/// Colour of the shaded area behind curves.
-const SHADE: RGBColor = RGBColor(0xf7, 0xe6, 0xd8);
-
 /// Heights of a panel with its title: if there are several panels, and if there is only one.
 const PANEL: i32 = 326;
 const ONLY_PANEL: i32 = 900;
@@ -61,7 +58,6 @@ pub struct Panel {
     pub scale: Scale,
     /// At most [`MAX_CURVES`] curves. Further curves are omitted.
     pub curves: Vec<Curve>,
-    pub shade: Option<Shade>,
 }
 
 /// The scale of a panel's values.
@@ -85,13 +81,6 @@ pub struct Point {
     pub y: f64,
     /// Half the height of the error band, 0 if there is no band.
     pub error: f64,
-}
-
-/// A shaded area above the axis, with a separate scale.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Shade {
-    pub name: String,
-    pub points: Vec<(f64, f64)>,
 }
 
 impl Point {
@@ -197,21 +186,13 @@ impl Panel {
         Y: AsRangedCoord<Value = f64>,
         Y::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
     {
-        let shade = self.shade.iter().flat_map(|shade| &shade.points);
-        let shade = shade.filter(|point| point.0 <= frame.last && is_drawable(point.1));
-        let shade: Vec<(f64, f64)> = shade.map(|&(x, y)| (x, y.max(0.0))).collect();
-        let most = shade.iter().map(|point| point.1);
-        let most = most.fold(f64::MIN_POSITIVE, f64::max);
         let mut chart = ChartBuilder::on(area)
             .margin_top(TITLE)
             .margin_left(MARGIN)
             .margin_right(WIDTH - frame.right)
             .x_label_area_size(TICKS)
             .y_label_area_size(MAX_TICK)
-            .build_cartesian_2d(0.0..frame.last, values)?
-            // The highest part of the shaded area reaches 40 % of the plot's height.
-            .set_secondary_coord(0.0..frame.last, 0.0..most / 0.4);
-        chart.draw_secondary_series(AreaSeries::new(shade, 0.0, SHADE))?;
+            .build_cartesian_2d(0.0..frame.last, values)?;
         chart
             .configure_mesh()
             .disable_x_mesh()
@@ -253,7 +234,8 @@ impl Panel {
             chart.draw_series(LineSeries::new(points, color.stroke_width(3)))?;
         }
         self.draw_names(area, frame.right, &ends)?;
-        self.draw_title(area)
+        let title = fit(&self.title, LABEL, WIDTH - 2 * MARGIN);
+        Ok(area.draw_text(&title, &style(LABEL, INK, HPos::Left), (MARGIN, 18))?)
     }
 
     /// Writes each curve's name next to its end on the page, with a connecting line.
@@ -274,20 +256,6 @@ impl Panel {
             area.draw_text(&curve.name, &style, (right + LEADER, name))?;
         }
         Ok(())
-    }
-
-    /// Writes the title, and at the right what is shaded.
-    fn draw_title(&self, area: &Area<'_>) -> Result<()> {
-        let mut right = WIDTH - MARGIN;
-        if let Some(shade) = &self.shade {
-            let name = fit(&shade.name, NOTE, WIDTH / 2);
-            right -= width(&name, NOTE);
-            area.draw_text(&name, &style(NOTE, MUTED, HPos::Left), (right, 18))?;
-            let square = [(right - 38, 5), (right - 12, 31)];
-            area.draw(&Rectangle::new(square, SHADE.filled()))?;
-        }
-        let title = fit(&self.title, LABEL, right - 2 * MARGIN);
-        Ok(area.draw_text(&title, &style(LABEL, INK, HPos::Left), (MARGIN, 18))?)
     }
 }
 

@@ -1,9 +1,9 @@
 //! `compare`: runs policies on the same worlds, and reports their results.
 
-use super::shared::{asks_for_help, check_csv, make_folder, write};
+use super::shared::{check_csv, make_folder, open_device, write};
 use super::worlds::{Source, WorldFlags};
 use crate::acting::team::Team;
-use crate::benchmark::compare::{Comparison, Results, compare};
+use crate::benchmark::compare::{Comparison, compare};
 use crate::benchmark::compared_worlds::ComparedWorlds;
 use crate::benchmark::report::common_worlds::check_worlds;
 use crate::benchmark::report::runs_file::{read_runs, write_runs};
@@ -16,18 +16,15 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
-use emberwatch_acting::policy::{self, Goal, LearnedDecisions, Policy};
+use emberwatch_acting::policy::{self, Policy};
 use emberwatch_learning::file::replace_file;
 use emberwatch_learning::learners;
-use emberwatch_network::DeviceKind;
+use emberwatch_network::DEVICES;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::task::Task;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
-
-/// The name that stands for all policies of [`policy::options_table`].
-const OPTIONS: &str = "options";
 
 /// Maximum time between two lines about the progress.
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(10);
@@ -38,16 +35,15 @@ const TEAM_POLICY: &str = "beam";
 /// Compare policies on the same worlds.
 #[derive(Args)]
 pub struct CompareCommand {
-    /// Policies, separated by commas, as names or as BELIEF/PLANNER/GOAL; `help` lists names and parts; `options`
-    /// stands for each option, the rule and the learned choice, on the belief of learned decisions [default: a ladder
-    /// of policies from random to oracle; with teams: beam]
+    /// Policies, separated by commas, as names or as BELIEF/PLANNER/GOAL, listed below [default: a ladder of policies
+    /// from random to oracle; with teams: beam]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
     /// Checkpoint of `train`, which adds learned policies to the ladder; may be given once per learner
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
-    /// Policy to compare the other policies with, paired by world [default: shooting; with options: the option
-    /// `exploit`; with teams: the first policy; on recorded worlds without --model: coverage]
+    /// Policy to compare the other policies with, paired by world [default: shooting; with teams: the first
+    /// policy; on recorded worlds without --model: coverage]
     #[arg(long)]
     baseline: Option<String>,
     /// Write a CSV file with one row per policy and world
@@ -64,11 +60,8 @@ pub struct CompareCommand {
     #[arg(long, value_delimiter = ',', default_value = "alone")]
     team: Vec<Team>,
     /// Device for networks: cpu, cuda or metal
-    #[arg(long, value_name = "DEVICE", default_value_t)]
-    device: DeviceKind,
-    /// Start known-model beliefs from each world's hidden state, instead of --prior
-    #[arg(long, conflicts_with = "prior")]
-    first_state_known: bool,
+    #[arg(long, value_name = "DEVICE", default_value = "cpu", value_parser = DEVICES)]
+    device: String,
     #[command(flatten, next_help_heading = "Worlds")]
     worlds: WorldFlags,
     #[command(flatten)]
@@ -77,27 +70,20 @@ pub struct CompareCommand {
 
 impl CompareCommand {
     pub fn run(&self) -> Result<()> {
-        if asks_for_help(&self.policies) {
-            return write(&policy::help());
-        }
-        self.check_names()?;
         let config = self.settings.effective()?;
         self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
-        let learned = learners::read(checkpoints, &self.device.open()?)?;
+        let learned = learners::read(checkpoints, &open_device(&self.device)?)?;
         let robots = self.worlds.robots();
         let numbers: Vec<Option<u32>> = match robots.as_slice() {
             [] => vec![None],
             robots => robots.iter().copied().map(Some).collect(),
         };
         let added = self.read_added()?;
-        // Errors in settings and policies come before any run.
+        // Errors in settings come before any run.
         let sources = numbers.into_iter().map(|number| self.worlds.source(number));
         let sources = sources.collect::<Result<Vec<Source>>>()?;
         let has_teams = self.has_teams(sources[0].task());
-        if let Some(model) = sources[0].model() {
-            self.policies(model, &learned, has_teams)?;
-        }
         let mut report = Report::default();
         for source in sources {
             let (seeds, task) = (self.worlds.seeds(&source), source.task().cloned());
@@ -114,13 +100,10 @@ impl CompareCommand {
                 steps: self.worlds.steps(task.as_ref(), worlds.info())?,
                 config: config.clone(),
                 learned: learned.clone(),
-                first_state_known: self.first_state_known,
             };
             self.check_added(&added, &comparison, worlds.info())?;
-            let results = run_comparison(worlds, &comparison)?;
             report.axis_label = axis_label(&worlds.model);
-            report.fire_cells = results.fire_cells;
-            report.runs.extend(results.runs);
+            report.runs.extend(run_comparison(worlds, &comparison)?);
         }
         self.write_results(&report, added, &config)
     }
@@ -188,31 +171,12 @@ impl CompareCommand {
         self.csv.as_deref().map_or(Ok(()), check_csv)
     }
 
-    /// Refuses policies that no server can run, whatever its model is.
-    fn check_names(&self) -> Result<()> {
-        let mut policies = self.policies.iter().filter(|name| *name != OPTIONS);
-        policies.try_for_each(|name| policy::check_name(name))?;
-        let mut baseline = self.baseline.iter();
-        let checked = baseline.try_for_each(|name| policy::check_name(name));
-        checked.context("--baseline")
-    }
-
     fn policies(&self, model: &Model, learned: &Learned, has_teams: bool) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
-        let with_options = |name: &String| {
-            if name == OPTIONS {
-                options(model, learned)
-            } else {
-                Ok(vec![named(name)?])
-            }
-        };
         let policies = match self.policies.as_slice() {
             [] if has_teams => vec![Policy::named(TEAM_POLICY, model)?],
             [] => policy::ladder(model, learned),
-            names => {
-                let policies = names.iter().map(with_options);
-                policies.collect::<Result<Vec<_>>>()?.concat()
-            }
+            names => names.iter().map(named).collect::<Result<_>>()?,
         };
         let twice = policies
             .iter()
@@ -236,7 +200,7 @@ impl CompareCommand {
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 
-    /// Returns the name of the baseline: `--baseline`, or the default for options, teams or the ladder.
+    /// Returns the name of the baseline: `--baseline`, or the default for teams or the ladder.
     fn baseline(
         &self,
         worlds: &ComparedWorlds,
@@ -247,18 +211,11 @@ impl CompareCommand {
             let policy = Policy::named(name, &worlds.model);
             return Ok(policy.context("--baseline")?.name);
         }
-        let mut policies = policies.iter();
-        let found = if self.policies.iter().any(|name| name == OPTIONS) {
-            policies.find(|policy| matches!(policy.goal, Goal::Option(_)))
-        } else {
-            policies.next().filter(|_| has_teams)
-        };
-        let default = if worlds.lacks_model() {
-            "coverage"
-        } else {
-            "shooting"
-        };
-        Ok(found.map_or(default, |policy| &policy.name).to_owned())
+        Ok(match policies.first() {
+            Some(first) if has_teams => first.name.clone(),
+            _ if worlds.lacks_model() => "coverage".into(),
+            _ => "shooting".into(),
+        })
     }
 }
 
@@ -266,8 +223,6 @@ impl CompareCommand {
 #[derive(Default)]
 struct Report {
     runs: Vec<PolicyRun>,
-    /// Burning cells per step. They do not depend on the number of robots.
-    fire_cells: Vec<f32>,
     axis_label: String,
     baseline: String,
 }
@@ -276,28 +231,20 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     let label = &*report.axis_label;
     draw_ladder(&directory.join("ladder.svg"), all, label)?;
     let rewards = directory.join("rewards.svg");
-    draw_rewards(&rewards, &report.runs, label, &report.fire_cells)?;
+    draw_rewards(&rewards, &report.runs, label)?;
     draw_teams(&directory.join("teams.svg"), all, label)?;
     let settings = toml::to_string(config)?;
     let path = directory.join("agent.toml");
     replace_file(&path, settings.as_bytes())
 }
 
-/// Returns one policy per option, the rule and the learned choice, all on the belief of the learned decisions.
-fn options(model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
-    let decisions = learned.get::<LearnedDecisions>();
-    let decisions =
-        decisions.context("--policies options: expected --checkpoint FILE of learned decisions")?;
-    Ok(policy::options_table(decisions.belief, model))
-}
-
 /// Runs a comparison and logs its progress.
 pub(super) fn run_comparison(
     worlds: &mut ComparedWorlds,
     comparison: &Comparison,
-) -> Result<Results> {
+) -> Result<Vec<PolicyRun>> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
-    let n_contestants = comparison.entries(&worlds.model).len() as u64;
+    let n_contestants = comparison.entries().len() as u64;
     let n_steps = n_contestants * n_seeds * comparison.steps;
     let (mut done, mut logged, mut last_policy) = (0, Instant::now(), String::new());
     compare(worlds, comparison, &mut |policy, steps| {

@@ -1,16 +1,16 @@
 //! `run`: acts on one world of a running server.
 
-use super::shared::{parse_range, parse_seconds};
+use super::shared::{open_device, parse_range, parse_seconds};
 use crate::acting::mission::Mission;
 use crate::acting::run::run;
 use crate::acting::team::Team;
 use crate::client::info::wait_for_server;
 use crate::flags::AgentFlags;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use clap::Args;
 use emberwatch_acting::policy::{self, Policy};
 use emberwatch_learning::learners;
-use emberwatch_network::DeviceKind;
+use emberwatch_network::DEVICES;
 use emberwatch_protocol::Model;
 use emberwatch_protocol::built_in::listed;
 use emberwatch_protocol::channels::Instance;
@@ -57,8 +57,8 @@ pub struct RunCommand {
         "Model, if the server does not reveal it: {}, or a model file", listed(Model::built_in_names())))]
     model: Option<String>,
     /// Device for networks: cpu, cuda or metal
-    #[arg(long, value_name = "DEVICE", default_value_t)]
-    device: DeviceKind,
+    #[arg(long, value_name = "DEVICE", default_value = "cpu", value_parser = DEVICES)]
+    device: String,
     #[command(flatten)]
     settings: AgentFlags,
 }
@@ -71,10 +71,6 @@ impl RunCommand {
             Some(model) => Policy::named(&self.policy, model).map(drop),
             None => policy::check_name(&self.policy),
         }?;
-        ensure!(
-            self.team != Team::Oracle,
-            "--team: expected alone, shared or joint, got oracle: choose --policy oracle_beam"
-        );
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
             world: self.world,
@@ -88,7 +84,7 @@ impl RunCommand {
             takeover: self.takeover,
             model,
             config: self.settings.effective()?,
-            learned: learners::read(self.checkpoint.as_deref(), &self.device.open()?)?,
+            learned: learners::read(self.checkpoint.as_deref(), &open_device(&self.device)?)?,
             stop: stop_on_signals().context("handle signals")?,
         };
         if !wait_for_server(&mission.instance, self.wait, || mission.is_over())? {

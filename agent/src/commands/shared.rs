@@ -3,16 +3,12 @@
 use crate::benchmark::report::runs_file::check_runs_file;
 use anyhow::{Context, Result};
 use emberwatch_learning::file::check_replaceable;
+use emberwatch_network::Device;
 use emberwatch_protocol::program::print;
 use std::ops::Range;
 use std::path::Path;
 use std::str::FromStr;
 use std::time::Duration;
-
-/// Returns whether `--policies help` asks for the list of policies.
-pub fn asks_for_help(policies: &[String]) -> bool {
-    policies.iter().any(|name| name == "help")
-}
 
 pub fn parse_seconds(text: &str) -> Result<Duration, String> {
     let limit = text.parse().ok().map(Duration::try_from_secs_f64);
@@ -49,6 +45,11 @@ pub fn check_csv(path: &Path) -> Result<()> {
     made.with_context(|| path.display().to_string())
         .and_then(|()| check_runs_file(path))
         .context("--csv")
+}
+
+/// Opens the device of `--device`.
+pub fn open_device(name: &str) -> Result<Device> {
+    emberwatch_network::open_device(name).map_err(anyhow::Error::msg)
 }
 
 pub fn write(text: &str) -> Result<()> {

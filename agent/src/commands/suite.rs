@@ -3,7 +3,7 @@
 //! The rows of a policy on a task are in the file `FOLDER/TASK/POLICY.csv`.
 
 use super::compare::run_comparison;
-use super::shared::{asks_for_help, make_folder, write};
+use super::shared::{make_folder, write};
 use super::trainings::{Trained, Trainings};
 use crate::acting::team::Team;
 use crate::benchmark::compare::Comparison;
@@ -19,7 +19,7 @@ use clap::Args;
 use emberwatch_acting::beliefs::WorldForm;
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
-use emberwatch_acting::policy::{self, Policy};
+use emberwatch_acting::policy::Policy;
 use emberwatch_protocol::task::Task;
 use emberwatch_sim::config::{Checked, ServerConfig};
 use emberwatch_sim::snapshot::Settings;
@@ -31,7 +31,7 @@ pub struct SuiteCommand {
     /// Tasks, separated by commas, as names or task files
     #[arg(long, value_delimiter = ',', default_values = Task::built_in_names())]
     tasks: Vec<String>,
-    /// Policies, separated by commas (`help` lists them); random_walk (score 0) and oracle_ahead (score 1) always run
+    /// Policies, separated by commas, listed below; random_walk (score 0) and oracle_ahead (score 1) always run
     #[arg(
         long,
         value_delimiter = ',',
@@ -60,11 +60,6 @@ pub struct SuiteCommand {
 
 impl SuiteCommand {
     pub fn run(&self) -> Result<()> {
-        if asks_for_help(&self.policies) {
-            return write(&policy::help());
-        }
-        let mut names = self.policies.iter();
-        names.try_for_each(|name| policy::check_name(name))?;
         let config = self.settings.effective()?;
         if let Some(folder) = &self.checkpoints {
             if self.train {
@@ -123,7 +118,6 @@ impl SuiteCommand {
             steps: task.world.max_steps,
             config: config.clone(),
             learned: Learned::default(),
-            first_state_known: false,
         };
         let folder = self.out.join(&task.name);
         make_folder(&folder)?;
@@ -166,7 +160,7 @@ impl SuiteCommand {
                 learned: trained.learned,
                 ..plan.comparison.clone()
             };
-            let mut new = run_comparison(&mut worlds, &comparison)?.runs;
+            let mut new = run_comparison(&mut worlds, &comparison)?;
             for run in &mut new {
                 run.task.clone_from(task);
                 run.training_seconds = trained.seconds;

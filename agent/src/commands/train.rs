@@ -1,6 +1,6 @@
 //! `train`: trains a learner while it acts.
 
-use super::shared::{make_folder, parse_seconds};
+use super::shared::{make_folder, open_device};
 use super::worlds::{BURN_IN, SimulationFlags};
 use crate::benchmark::report::training::draw_training;
 use crate::client::worlds::Worlds;
@@ -14,7 +14,7 @@ use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
 use emberwatch_learning::checkpoint::Contents;
 use emberwatch_learning::learners::{self, LEARNERS, LearnerKind};
-use emberwatch_network::{Device, DeviceKind};
+use emberwatch_network::{DEVICES, Device};
 use emberwatch_protocol::channels::{Instance, MAX_WORLDS};
 use emberwatch_protocol::client::Backend;
 use emberwatch_protocol::control::CoverageRule;
@@ -26,10 +26,6 @@ use rand_chacha::rand_core::Rng;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::sync::atomic::Ordering::Relaxed;
-use std::time::{Duration, Instant};
-
-/// Default number of training worlds, except for a learner that follows a single world.
-pub(super) const N_WORLDS: u32 = 16;
 
 /// Learn a model while acting.
 #[derive(Args)]
@@ -46,24 +42,21 @@ pub struct TrainCommand {
     steps: Option<u64>,
     /// Checkpoint of the --estimator from an earlier training; without it, a learned estimator is trained first. With
     /// --learner neural: a filter whose belief the network corrects
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     checkpoint: Option<PathBuf>,
     /// Resume from the folder's checkpoint, in worlds that the training has not seen. The replay buffer starts empty
     #[arg(long)]
     resume: bool,
     /// Estimator whose belief decisions are learned on [default: learned; with --resume: the checkpoint's]
-    #[arg(long, value_name = "NAME", value_parser = beliefs::of_options)]
+    #[arg(long, value_name = "NAME", value_parser = beliefs::of_options, conflicts_with = "resume")]
     estimator: Option<&'static BeliefKind>,
-    /// Maximum seconds to act, including the training of an estimator
-    #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
-    time_limit: Option<Duration>,
     /// Cells that frames show to a filter in training: path (those in sight of the path) or full (every cell, if the
     /// server's coverage is `client` or `full`) [default: from the settings; with --resume: the checkpoint's]
-    #[arg(long, value_name = "CELLS", value_parser = ["path", "full"])]
+    #[arg(long, value_name = "CELLS", value_parser = ["path", "full"], conflicts_with = "resume")]
     coverage: Option<String>,
     /// Device for an autoencoder or a neural belief: cpu, cuda or metal
-    #[arg(long, value_name = "DEVICE", default_value_t)]
-    device: DeviceKind,
+    #[arg(long, value_name = "DEVICE", default_value = "cpu", value_parser = DEVICES)]
+    device: String,
     /// Train on this running server, instead of simulating worlds
     #[arg(help_heading = "Worlds", long, conflicts_with = "settings")]
     instance: Option<String>,
@@ -96,8 +89,6 @@ impl TrainCommand {
         let mut training = self.training()?;
         let contents = self.contents(&mut training)?;
         let mut worlds = self.worlds(&training)?;
-        let end = |limit| Instant::now().checked_add(limit);
-        training.deadline = self.time_limit.and_then(end);
         if contents.is_none() && needs_belief(&training)? {
             learn_belief(&mut worlds, &training, &stop)?;
             if stop.load(Relaxed) {
@@ -107,7 +98,7 @@ impl TrainCommand {
             training.learned = learners::read([&*belief], &training.device)?;
             (training.resume, training.first_seed) = (false, None);
         }
-        learn(&mut worlds, &training, contents, &stop).map(drop)
+        learn(&mut worlds, &training, contents, &stop)
     }
 
     fn training(&self) -> Result<TrainingSpec> {
@@ -123,23 +114,20 @@ impl TrainCommand {
         if let Some(coverage) = &self.coverage {
             config.full_frames = coverage == "full";
         }
-        let n_worlds = self
-            .worlds
-            .unwrap_or(if kind.is_single { 1 } else { N_WORLDS });
+        let n_worlds = self.worlds.unwrap_or(kind.n_worlds());
         let last = self.world.checked_add(n_worlds);
         let last = last.with_context(|| {
             let world = self.world;
             format!("--world: expected a world that a server can have, got {world}")
         })?;
         let steps = (kind.steps)(&config);
-        let device = self.device.open()?;
+        let device = open_device(&self.device)?;
         let learned = self.learned(kind, &config, &device)?;
         make_folder(&self.out)?;
         Ok(TrainingSpec {
             worlds: self.world..last,
             takeover: self.takeover,
             steps: self.steps.unwrap_or(steps),
-            deadline: None,
             out: self.out.clone(),
             resume: self.resume,
             first_seed: None,
@@ -211,31 +199,8 @@ impl TrainCommand {
             }
             None => done.unwrap_or(0),
         };
-        self.check_adopted(&training.config)?;
         training.first_seed = Some(self.next_seed(done));
         Ok(contents)
-    }
-
-    /// Refuses flags that differ from the settings of the checkpoint to resume.
-    fn check_adopted(&self, adopted: &AgentConfig) -> Result<()> {
-        let coverage = if adopted.full_frames { "full" } else { "path" };
-        let estimator = self.estimator.map(|kind| kind.name);
-        for (flag, got, expected) in [
-            ("coverage", self.coverage.as_deref(), coverage),
-            ("estimator", estimator, &adopted.decisions.estimator),
-        ] {
-            ensure!(
-                got.is_none_or(|got| got == expected),
-                "--{flag}: expected {expected} as in the checkpoint, got {}",
-                got.unwrap_or_default()
-            );
-        }
-        ensure!(
-            self.checkpoint.is_none(),
-            "--checkpoint cannot be combined with --resume, which continues with the belief in {}",
-            self.out.display()
-        );
-        Ok(())
     }
 
     /// Returns the seed of the first world of a resumed training, which depends on the number of world steps done.
@@ -308,21 +273,16 @@ fn learn_belief(worlds: &mut Worlds, training: &TrainingSpec, stop: &AtomicBool)
         return Ok(());
     };
     make_folder(&belief.out)?;
-    let n_steps = learn(worlds, &belief, belief.check()?, stop)?;
-    ensure!(
-        n_steps >= belief.steps || stop.load(Relaxed),
-        "--time-limit: the time ended before the belief was learned: continue with --resume"
-    );
-    Ok(())
+    learn(worlds, &belief, belief.check()?, stop)
 }
 
-/// Trains, logs a summary, draws the metrics, and returns the number of world steps.
+/// Trains, logs a summary, and draws the metrics.
 pub(super) fn learn(
     worlds: &mut Worlds,
     training: &TrainingSpec,
     contents: Option<Contents>,
     stop: &AtomicBool,
-) -> Result<u64> {
+) -> Result<()> {
     let learner = &training.config.learner;
     tracing::info!(learner, steps = training.steps, out = %training.out.display(), "learning");
     let summary = train(worlds, training, contents, stop)?;
@@ -333,11 +293,8 @@ pub(super) fn learn(
         mean_reward,
         "done"
     );
-    let [planning_seconds, learning_seconds] =
-        [summary.planning, summary.learning].map(|time| time.as_secs_f64());
-    tracing::info!(planning_seconds, learning_seconds, "time");
     if summary.steps > 0 {
         draw_training(&training.out)?;
     }
-    Ok(summary.steps)
+    Ok(())
 }

@@ -4,7 +4,7 @@
 //! `decisions-BELIEF` for decisions on a belief.
 
 use super::shared::make_folder;
-use super::train::{N_WORLDS, learn, simulate};
+use super::train::{learn, simulate};
 use crate::training::{CHECKPOINT, TrainingSpec, seconds};
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_acting::beliefs::WorldForm;
@@ -14,7 +14,6 @@ use emberwatch_acting::policy::Policy;
 use emberwatch_acting::rollout::building;
 use emberwatch_learning::learners;
 use emberwatch_learning::learners::decisions::DECISIONS;
-use emberwatch_learning::learners::filter::FILTER;
 use emberwatch_network::Device;
 use emberwatch_protocol::task::FIRST_TRAINING_SEED;
 use emberwatch_sim::config::Checked;
@@ -91,19 +90,15 @@ impl Trainings<'_> {
             config.decisions.estimator = self.policy.belief.name.into();
         }
         let kind = learners::named(learner).map_err(anyhow::Error::msg)?;
-        let steps = self.steps.unwrap_or(match (kind.steps)(&config) {
-            0 if *kind == FILTER => config.decisions.filter_steps,
-            steps => steps,
-        });
+        let steps = self.steps.unwrap_or(kind.full_steps(&config));
         ensure!(
             steps > 0,
             "--train-steps: expected a number of steps, as the {learner} has no default length"
         );
         let spec = TrainingSpec {
-            worlds: 0..if kind.is_single { 1 } else { N_WORLDS },
+            worlds: 0..kind.n_worlds(),
             takeover: false,
             steps,
-            deadline: None,
             resume: false,
             first_seed: None,
             out: self.folder.join(format!("training.{}", std::process::id())),

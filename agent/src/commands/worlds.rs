@@ -151,15 +151,6 @@ impl Source {
         }
     }
 
-    /// Returns the model of beliefs about worlds to simulate, if one is known.
-    pub fn model(&self) -> Option<&Model> {
-        match self {
-            Self::Server(_) => None,
-            Self::Settings(checked, known) if checked.recorded.is_some() => known.as_deref(),
-            Self::Settings(checked, _) => Some(&checked.model),
-        }
-    }
-
     /// Opens the worlds for a comparison on `n_seeds` seeds.
     ///
     /// # Errors

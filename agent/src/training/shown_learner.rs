@@ -19,7 +19,7 @@ pub struct ShownLearner<'a> {
     /// Number of robots per world.
     team: u32,
     /// Time to compute the last plans of all robots together.
-    pub planning: Duration,
+    planning: Duration,
 }
 
 impl<'a> ShownLearner<'a> {

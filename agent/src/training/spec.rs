@@ -13,20 +13,17 @@ use emberwatch_protocol::control::ServerInfo;
 use emberwatch_protocol::message::Status;
 use std::ops::Range;
 use std::path::PathBuf;
-use std::time::Instant;
 
 /// Name of the checkpoint in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct TrainingSpec {
     /// Worlds to train on, with all their robots.
     pub worlds: Range<u32>,
     pub takeover: bool,
     /// World steps to act, summed over all worlds; 0: until stopped.
     pub steps: u64,
-    /// Deadline, which also limits the training of a belief; `None`: no limit.
-    pub deadline: Option<Instant>,
     pub out: PathBuf,
     pub resume: bool,
     /// Seed of the first world; world i begins with this seed plus i. `None`: running episodes continue.
@@ -87,10 +84,7 @@ impl TrainingSpec {
         belief.resume = self.resume && belief.out.join(CHECKPOINT).exists();
         let kind = belief.learner()?;
         let done = belief.check()?.map(|contents| (kind.done)(&contents));
-        let all = match (kind.steps)(&self.config) {
-            0 => self.config.decisions.filter_steps,
-            steps => steps,
-        };
+        let all = kind.full_steps(&self.config);
         belief.steps = all.saturating_sub(done.transpose()?.unwrap_or(0));
         Ok((belief.steps > 0).then_some(belief))
     }

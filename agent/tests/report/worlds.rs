@@ -21,7 +21,7 @@ fn a_policy_has_one_run_for_each_world() {
         (vec![first, second], "each of 3 worlds, got 2 rows"),
         (
             vec![first, second, second, third],
-            "expected a row for world 2, got one for world 1",
+            "expected world 2 for 4 steps, worlds_fingerprint \"884869f24f9fd933\", got world 1 for 4 steps",
         ),
         (vec![first, &longer, third], "got world 1 for 5 steps"),
         (vec![&elsewhere], "worlds_fingerprint \"\""),

@@ -9,7 +9,7 @@ use crate::saved::{Saved, is_saved};
 use crate::threads::Pool;
 use emberwatch_belief::brier::{accuracy, brier_score, log_loss};
 use emberwatch_belief::estimation::SpatialFilter;
-use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError};
 use emberwatch_belief::estimation::scoring::score;
 use emberwatch_learning::file::replace_file;
@@ -193,7 +193,7 @@ impl Estimators {
 
     /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
-        self.of_cells(py, true, |_, belief| belief.entropy(EntropyKind::Sum))
+        self.of_cells(py, true, |_, belief| belief.entropy())
     }
 
     /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep the correlations

@@ -28,7 +28,6 @@ KINDS = {
     "learned": "learned_filter",
     "learned+spatial": "learned_filter",
     "neural": "neural_belief",
-    "neural+sensor": "neural_belief",
 }
 
 

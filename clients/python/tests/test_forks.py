@@ -71,7 +71,7 @@ CASES = {
     **{name: (known(name, 2), believe)
        for name, kind in belief.kinds().items() if not kind.needs_checkpoint},
     **{name: (load("learned_filter", name, 2), believe) for name in ("learned", "learned+spatial")},
-    **{name: (load("neural_belief", name, 1), believe) for name in ("neural", "neural+sensor")},
+    "neural": (load("neural_belief", "neural", 1), believe),
     "neural, many worlds": (load("neural_belief", "neural", 40, 16), believe),
     "autoencoder": (load("autoencoder", None, 2), believe),
     "beam_search": (lambda: 50, plan),

@@ -135,7 +135,6 @@ fn write(folder: &Path, rows: &[(f64, Use)]) {
                 .map(|(seconds, used)| Point::new(*seconds, value(used)))
                 .collect(),
         }],
-        shade: None,
     };
     let page = Lines {
         title: "A server while agents come and go".into(),

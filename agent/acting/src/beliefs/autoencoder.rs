@@ -1,7 +1,6 @@
 //! The autoencoder as an estimator: frames update a hidden vector (paper eq. 9), and Bayes' rule corrects visited cells
 //! (eq. 10).
 
-use super::follower::Follower;
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy, Traits, cast};
 use super::learned::LEARNED;
 use super::world_form::WorldForm;
@@ -9,11 +8,11 @@ use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::bayes::correct;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{Estimator, EstimatorError, ObservationModel};
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::Frame;
-use emberwatch_network::{Autoencoder, Dqn, NetworkError};
+use emberwatch_network::{Autoencoder, Dqn, NetworkError, Window};
 use ndarray::Array2;
 use std::borrow::Cow;
+use std::sync::Arc;
 
 pub const AUTOENCODER: BeliefKind = BeliefKind {
     name: "autoencoder",
@@ -42,13 +41,10 @@ pub const AUTOENCODER: BeliefKind = BeliefKind {
 };
 
 /// The result of Algorithm 1: everything that an agent needs to act on its belief.
-#[derive(Debug)]
 pub struct AutoencoderModel {
     pub autoencoder: Autoencoder,
     /// Chooses an objective from the hidden vector (paper section III.E).
-    pub dqn: Dqn,
-    /// The belief that paths were planned on while the DQN was trained.
-    pub basis: BasisKind,
+    pub dqn: Arc<Dqn>,
     /// The state with the highest reward.
     pub target: usize,
 }
@@ -88,41 +84,48 @@ impl LearnedBelief for AutoencoderModel {
 
 pub struct AutoencoderEstimator {
     network: Autoencoder,
-    follower: Follower,
+    /// The hidden vector `h_k`.
+    hidden: Vec<f32>,
+    /// The predictor `u_{k+1}`.
+    prediction: Belief,
     /// The estimate `p_k` or the predictor `u_{k+1}`.
     belief: Belief,
 }
 
 impl AutoencoderEstimator {
-    /// Creates the estimator before its first frame.
+    /// Creates the estimator before its first frame, with `h ~ N(0, I)`, determined by the network's seed.
     pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
-        let follower = Follower::new(network)?;
+        let hidden = network.first_hidden();
+        let prediction = predictor(network, &hidden)?;
         Ok(Self {
             network: network.clone(),
-            belief: follower.prediction.clone(),
-            follower,
+            hidden,
+            belief: prediction.clone(),
+            prediction,
         })
     }
 
     /// Returns the hidden vector `h_k` from which the belief is computed, the input of the DQN (paper section III.E).
     pub fn hidden(&self) -> &[f32] {
-        &self.follower.hidden
+        &self.hidden
     }
 }
 
 impl Estimator for AutoencoderEstimator {
     /// Applies Bayes' rule with the learned `O` at visited cells (eq. 10). Other cells keep the predictor.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
-        let mut estimate = self.follower.prediction.clone();
+        let mut estimate = self.prediction.clone();
         let likelihood = likelihood(&self.network).map_err(failed)?;
         correct(&mut estimate, &likelihood, frame)?;
-        self.follower = self.follower.after(&self.network, frame).map_err(failed)?;
-        self.belief = estimate;
+        let hidden = self.network.advance(&Window::new([frame]), &self.hidden);
+        let hidden = hidden.map_err(failed)?;
+        self.prediction = predictor(&self.network, &hidden).map_err(failed)?;
+        (self.hidden, self.belief) = (hidden, estimate);
         Ok(())
     }
 
     fn predict(&mut self) {
-        self.belief.clone_from(&self.follower.prediction);
+        self.belief.clone_from(&self.prediction);
     }
 
     fn belief(&self) -> &Belief {
@@ -134,6 +137,11 @@ impl ObservationModel for AutoencoderEstimator {
     fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
         likelihood(&self.network).ok().map(Cow::Owned)
     }
+}
+
+fn predictor(network: &Autoencoder, hidden: &[f32]) -> Result<Belief, NetworkError> {
+    let belief = Belief::from_probabilities(network.predict(hidden)?);
+    Ok(belief.expect("invariant: a softmax is on the simplex"))
 }
 
 fn failed(error: NetworkError) -> EstimatorError {

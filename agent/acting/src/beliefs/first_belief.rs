@@ -8,9 +8,6 @@ use emberwatch_model::ModelError;
 use emberwatch_model::{Model, Shape};
 use std::cell::Cell;
 
-/// Number of cell updates that one core simulates per second: one step of 64 x 64 cells of the wildfire takes 3.4 us.
-const CELLS_PER_SECOND: f64 = 1.2e9;
-
 /// Returns the belief before the first frame, from the cache if possible. See [`Prior::belief`].
 pub fn first_belief(
     prior: Prior,
@@ -22,7 +19,11 @@ pub fn first_belief(
         return prior.belief(model, shape, seed);
     };
     let make = || {
-        announce(n_worlds, burn_in, shape);
+        tracing::info!(
+            worlds = n_worlds,
+            steps = burn_in,
+            "simulating the first belief"
+        );
         prior.belief(model, shape, seed)
     };
     let is_told = Cell::new(false);
@@ -37,16 +38,4 @@ pub fn first_belief(
         Some(kept) => kept.read_or_make(pause, make),
         None => make(),
     }
-}
-
-/// Logs that a simulation begins, and how long it may take.
-fn announce(n_worlds: usize, burn_in: u64, shape: Shape) {
-    let cells = n_worlds as f64 * burn_in as f64 * shape.n_cells() as f64;
-    let seconds = cells / CELLS_PER_SECOND / rayon::current_num_threads() as f64;
-    tracing::info!(
-        worlds = n_worlds,
-        steps = burn_in,
-        about_seconds = seconds.ceil(),
-        "simulating the first belief"
-    );
 }

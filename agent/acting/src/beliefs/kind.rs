@@ -119,7 +119,7 @@ pub trait LearnedBelief {
 }
 
 /// The inputs from which a belief is built.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct Conditions<'a> {
     pub shape: Shape,
     /// The true model, if it is known.

@@ -3,16 +3,13 @@
 //! The network reads each cell's last observation and its age. It can also read a filter's prediction and correct it.
 //!
 //! The belief is about observations instead of states, so S = O. After a frame, the observations of visited cells have
-//! probability 1. If the observation matrix is known, the belief is about states: `sensor.rs` converts predicted
-//! observations to states, and a frame corrects the states by Bayes' rule (eq. 5).
-
-mod sensor;
+//! probability 1.
 
 use super::kind::{BeliefKind, Input, LearnedBelief, LearnedBy, Traits, cast_mut};
 use super::learned::{LEARNED, LearnedModel};
 use super::world_form::WorldForm;
 use crate::parallel::in_parallel;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use emberwatch_belief::estimation::bayes::{check as check_evidence, correct, observations};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::estimator::{
@@ -22,7 +19,6 @@ use emberwatch_model::grid::Probabilities;
 use emberwatch_model::{Frame, Shape};
 use emberwatch_network::{NetworkError, NeuralBelief, Sightings};
 use ndarray::Array2;
-use sensor::{inverse, states_from_observations};
 use std::borrow::Cow;
 
 pub const NEURAL: BeliefKind = BeliefKind {
@@ -51,24 +47,8 @@ pub const NEURAL: BeliefKind = BeliefKind {
     },
 };
 
-pub const NEURAL_SENSOR: BeliefKind = BeliefKind {
-    name: "neural+sensor",
-    about: "neural, converted to states by the true model's observation matrix",
-    knows_model: true,
-    has_options: false,
-    is_of_observations: false,
-    build: |conditions| {
-        let model = conditions.learned.get::<NeuralModel>();
-        let model = model.context("checkpoint: expected a learned neural belief, got none")?;
-        let estimator = model.estimator(conditions.shape).context("checkpoint")?;
-        let likelihood = conditions.model()?.likelihood().clone();
-        Ok(Box::new(estimator.with_sensor(likelihood)?))
-    },
-    ..NEURAL
-};
-
 /// A learned neural belief: everything that an agent needs to act on it.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct NeuralModel {
     pub network: NeuralBelief,
     /// The filter whose prediction the network corrects, if any.
@@ -134,12 +114,10 @@ pub struct NeuralEstimator {
     /// The distribution over observations that the filter predicts, shape `[O, H, W]`.
     base: Option<Probabilities>,
     sightings: Sightings,
-    /// The belief about the next observation of each cell, or about its state if the sensor is known.
+    /// The belief about the next observation of each cell.
     belief: Belief,
-    /// `P(y | x)` of the sensor, shape `[S, O]`, or the identity if the sensor is unknown.
+    /// The identity, because the belief is about observations.
     likelihood: Array2<f64>,
-    /// The inverse of `likelihood`, if the sensor is known.
-    inverse: Option<Array2<f64>>,
     /// The error of the last prediction, if it failed.
     failure: Option<NetworkError>,
 }
@@ -160,44 +138,13 @@ impl NeuralEstimator {
             base,
             sightings,
             likelihood: Array2::eye(network.n_observations()),
-            inverse: None,
             failure: None,
         })
-    }
-
-    /// Converts the belief to a belief about states. `likelihood` is the sensor's observation matrix `P(y | x)`, shape
-    /// `[S, S]`.
-    ///
-    /// # Errors
-    /// If the matrix has another shape or no inverse.
-    pub fn with_sensor(mut self, likelihood: Array2<f64>) -> Result<Self> {
-        let (expected, got) = (self.likelihood.dim(), likelihood.dim());
-        ensure!(
-            expected == got,
-            "sensor: expected an observation matrix of shape {expected:?}, got {got:?}"
-        );
-        let inverse = inverse(&likelihood);
-        let inverse = inverse.context(
-            "sensor: expected an invertible observation matrix, got states that look alike",
-        )?;
-        self.likelihood = likelihood;
-        self.inverse = Some(inverse);
-        self.set_predicted(self.belief.probabilities().clone());
-        Ok(self)
     }
 
     /// Returns the distribution of each cell's next observation, shape `[O, H, W]`, as predicted by the refined filter.
     pub fn base(&self) -> Option<&Probabilities> {
         self.base.as_ref()
-    }
-
-    /// Sets the belief from the predicted distribution of each cell's next observation, `[O, H, W]`.
-    fn set_predicted(&mut self, mut observations: Probabilities) {
-        if let Some(inverse) = &self.inverse {
-            states_from_observations(&mut observations, inverse);
-        }
-        self.belief = belief(observations);
-        self.failure = None;
     }
 }
 
@@ -241,16 +188,7 @@ impl Handover for NeuralEstimator {
         let checksum = crc32fast::hash(&bytes);
         let filter = self.filter.as_ref();
         let filter = filter.map_or(String::new(), |it| format!(" on {}", it.kind()));
-        let sensor = if self.inverse.is_some() {
-            let numbers = self.likelihood.iter().flat_map(|p| p.to_le_bytes());
-            let checksum = crc32fast::hash(&numbers.collect::<Vec<u8>>());
-            format!(" through {checksum:08x}")
-        } else {
-            String::new()
-        };
-        format!(
-            "neural_belief {checksum:08x}{sensor}, probabilities [O, H, W] as f32, sightings{filter}"
-        )
+        format!("neural_belief {checksum:08x}, probabilities [O, H, W] as f32, sightings{filter}")
     }
 
     fn to_bytes(&self) -> Vec<u8> {
@@ -322,7 +260,7 @@ impl NeuralEstimator {
         match predicted {
             Ok(predicted) => {
                 for (estimator, probabilities) in all.iter_mut().zip(predicted) {
-                    estimator.set_predicted(probabilities);
+                    (estimator.belief, estimator.failure) = (belief(probabilities), None);
                 }
             }
             Err(failure) => {

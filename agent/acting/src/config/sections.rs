@@ -1,22 +1,8 @@
 //! The sections of `config/agent.toml`, which explains each setting.
 
 use anyhow::{Result, bail};
-use emberwatch_belief::estimation::belief::EntropyKind;
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
-
-/// Maximum decay rate of Adam's moving averages. At 1, the averages would never change.
-const MAX_BETA: f64 = 0.999_999;
-
-/// Terms that planners maximise in addition to the target that the policy's name specifies (paper eqs. 13 to 15).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct ObjectiveConfig {
-    pub shooting_bonus: f32,
-    pub beam_bonus: f32,
-    pub entropy: EntropyKind,
-    pub belief: BasisKind,
-}
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LearningConfig {
@@ -28,13 +14,10 @@ pub struct LearningConfig {
     pub replay_frames: usize,
     pub rate: f64,
     pub observation_rate: f64,
-    pub beta1: f64,
-    pub beta2: f64,
     pub steady_updates: u64,
     pub falling_updates: u64,
     pub final_rate: f64,
     pub updates_per_step: f64,
-    pub anchor: f64,
     pub explore_steps: u64,
     pub explore_share: f64,
 }
@@ -61,7 +44,6 @@ pub struct AutoencoderConfig {
     pub window: usize,
     pub replay_frames: usize,
     pub full_frames: u64,
-    pub betas: [f32; 2],
     pub step_size: StepSize,
 }
 
@@ -116,16 +98,6 @@ pub(super) fn check(section: &str, settings: &[Range<'_>]) -> Result<()> {
     Ok(())
 }
 
-impl ObjectiveConfig {
-    pub(super) fn check(&self) -> Result<()> {
-        let ranges = [
-            ("shooting_bonus", self.shooting_bonus.into(), 0.0, 1e3),
-            ("beam_bonus", self.beam_bonus.into(), 0.0, 1e3),
-        ];
-        check("objective.", &ranges)
-    }
-}
-
 impl LearningConfig {
     pub(super) fn check(&self) -> Result<()> {
         let ranges = [
@@ -136,11 +108,8 @@ impl LearningConfig {
             ("replay_frames", self.replay_frames as f64, 1.0, 1.6e7),
             ("rate", self.rate, 0.0, 1.0),
             ("observation_rate", self.observation_rate, 0.0, 100.0),
-            ("beta1", self.beta1, 0.0, MAX_BETA),
-            ("beta2", self.beta2, 0.0, MAX_BETA),
             ("final_rate", self.final_rate, 0.0, 1.0),
             ("updates_per_step", self.updates_per_step, 0.0, 1e3),
-            ("anchor", self.anchor, 0.0, 1e3),
             ("explore_share", self.explore_share, 0.0, 1.0),
         ];
         check("learning.", &ranges)
@@ -173,15 +142,13 @@ impl NeuralConfig {
 
 impl AutoencoderConfig {
     pub(super) fn check(&self) -> Result<()> {
-        let (window, [beta1, beta2]) = (self.window as f64, self.betas.map(f64::from));
+        let window = self.window as f64;
         let ranges = [
             states(self.states),
             ("encoding", self.encoding as f64, 1.0, 256.0),
             ("hidden", self.hidden as f64, 1.0, 256.0),
             ("window", window, 2.0, 1e4),
             ("replay_frames", self.replay_frames as f64, window, 1e5),
-            ("betas", beta1, 0.0, MAX_BETA),
-            ("betas", beta2, 0.0, MAX_BETA),
         ];
         check("autoencoder.", &ranges)?;
         check("autoencoder.step_size.", &self.step_size.ranges())
@@ -194,10 +161,7 @@ impl AutoencoderConfig {
             hidden: self.hidden,
             window: self.window,
             replay: self.replay_frames,
-            adam: AdamSettings {
-                betas: self.betas,
-                ..AdamSettings::paper(self.step_size.rate as f32)
-            },
+            adam: AdamSettings::paper(self.step_size.rate as f32),
         }
     }
 }

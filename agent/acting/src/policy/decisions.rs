@@ -1,18 +1,14 @@
 //! Learned decisions: the choice of the option with the highest value.
 
 use crate::beliefs::BeliefKind;
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_network::Dqn;
 use std::sync::Arc;
 
 /// The learned values that are used by policies with the planner `options` and the goal `learned`.
-#[derive(Debug, Clone)]
 pub struct LearnedDecisions {
     pub scorer: Arc<Dqn>,
     /// The belief that the decisions were learned on.
     pub belief: &'static BeliefKind,
-    /// The belief that paths are planned on: the predictor or the estimate.
-    pub basis: BasisKind,
     /// Width of the beam search that plans options.
     pub beam_width: usize,
 }

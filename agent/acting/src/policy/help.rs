@@ -1,4 +1,4 @@
-//! The list of all parts of policies, for `--help` and `--policies help`.
+//! The list of all parts of policies, for `--help`.
 
 use super::goals::{GOALS, GoalEntry, OPTION_GOALS};
 use super::names::NAMED;

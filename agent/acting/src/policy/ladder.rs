@@ -5,11 +5,9 @@ use super::goals::Goal;
 use super::parts::Policy;
 use super::planners::{AHEAD, BEAM, BY_OPTIONS, RANDOM, SHOOTING};
 use crate::beliefs::{
-    AUTOENCODER, BeliefKind, Input, KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL, NONE, RECOMMENDED,
-    TRUTH,
+    AUTOENCODER, BeliefKind, KNOWN, LEARNED, LEARNED_SPATIAL, NEURAL, NONE, RECOMMENDED, TRUTH,
 };
 use crate::learned::Learned;
-use emberwatch_belief::planning::options::OPTIONS;
 use emberwatch_model::Model;
 
 /// Returns the policies of the benchmark for a model and checkpoints, from the least to the most informed.
@@ -65,17 +63,6 @@ fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
         .collect()
 }
 
-/// Returns the policies for a table of all options on one belief: random moves, then each option, the rule, and, if
-/// frames correct the belief, the learned choice.
-pub fn options_table(belief: &'static BeliefKind, model: &Model) -> Vec<Policy> {
-    let options = OPTIONS.iter().map(Goal::Option).chain([Goal::Rule]);
-    let learned = (belief.input == Input::Frames).then_some(Goal::Learned);
-    let goals = options.chain(learned);
-    let first = Policy::new(&NONE, &RANDOM, Goal::Coverage, model);
-    let rest = goals.map(|goal| Policy::new(belief, &BY_OPTIONS, goal, model));
-    std::iter::once(first).chain(rest).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -88,15 +75,5 @@ mod tests {
              shooting known/shooting/exploit_only known/beam/exploit known+spatial+cavities/shooting/exploit beam \
              truth/shooting/exploit oracle_beam oracle_ahead oracle_policy";
         assert_eq!(names.join(" "), expected);
-    }
-
-    #[test]
-    fn options_tables_have_one_policy_per_option() {
-        let model = Model::wildfire();
-        for (belief, n_chosen) in [(&KNOWN, 2), (&TRUTH, 1)] {
-            let table = options_table(belief, &model);
-            assert_eq!(table.len(), 1 + OPTIONS.len() + n_chosen);
-            assert!(table[1..].iter().all(|policy| policy.belief == belief));
-        }
     }
 }

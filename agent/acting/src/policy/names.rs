@@ -137,15 +137,9 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
 /// Returns the error for a name that is neither short nor made of parts.
 fn unknown(name: &str) -> String {
     let got = shortened(name);
-    // Short names of earlier versions were made of planner and goal; the belief was `known`.
-    if let Some((planner @ ("beam" | "shooting"), goal)) = name.split_once('_')
-        && !goal.is_empty()
-    {
-        return format!("policy: {got:?} is not a short name any more: use known/{planner}/{goal}");
-    }
     format!(
         "policy: expected one of {}, or BELIEF/PLANNER/GOAL such as learned+spatial/beam/exploit (see `compare \
-         --policies help`), got {got:?}",
+         --help`), got {got:?}",
         listed(NAMED.iter().map(|(name, _)| *name))
     )
 }
@@ -260,12 +254,6 @@ mod tests {
             ("known/beam/learned", "latent, fire, got \"learned\""),
             ("learned/beam/fire", "goal: expected one of coverage, "),
             ("learned_", "got \"learned_\""),
-            ("beam_", "got \"beam_\""),
-            (
-                "beam_exploit",
-                "\"beam_exploit\" is not a short name any more: use known/beam/exploit",
-            ),
-            ("shooting_latent", ": use known/shooting/latent"),
         ] {
             let error = Policy::named(name, &model).expect_err(name).to_string();
             assert!(error.contains(words), "{error}");

@@ -4,7 +4,6 @@ use super::decisions::LearnedDecisions;
 use super::goals::Goal;
 use super::planners::{BEAM, BY_OPTIONS, PlannerKind, SHOOTING};
 use crate::beliefs::{AUTOENCODER, BeliefKind};
-use crate::config::AgentConfig;
 use crate::learned::Learned;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::planning::{Objective, Target};
@@ -70,9 +69,8 @@ impl Policy {
         Ok(decisions)
     }
 
-    /// Returns the objective under the given settings. `target` is the index of the state with the highest reward.
-    pub fn objective(&self, target: usize, config: &AgentConfig) -> Objective {
-        let settings = &config.objective;
+    /// Returns the objective. `target` is the index of the state with the highest reward.
+    pub fn objective(&self, target: usize) -> Objective {
         let target = match self.goal {
             Goal::Coverage => Target::Coverage,
             Goal::Explore => Target::Entropy,
@@ -84,12 +82,11 @@ impl Policy {
         let coverage_bonus = match self.goal {
             Goal::Coverage => 1.0,
             Goal::ExploitOnly => 0.0,
-            _ => (self.planner.bonus)(settings),
+            _ => self.planner.bonus,
         };
         Objective {
             target,
             coverage_bonus,
-            entropy: settings.entropy,
         }
     }
 }
@@ -114,36 +111,27 @@ mod tests {
     use emberwatch_belief::planning::objective::BEAM_BONUS;
     use emberwatch_model::Model;
 
-    fn objective(name: &str, config: &AgentConfig) -> Objective {
+    fn objective(name: &str) -> Objective {
         let policy = Policy::named(name, &Model::wildfire()).expect("a known name");
-        policy.objective(2, config)
+        policy.objective(2)
     }
 
     #[test]
     fn default_bonuses_are_the_authors_and_small_for_beam() {
-        let config = AgentConfig::default();
         let [fire, entropy] = [Target::State(2), Target::Entropy].map(Objective::paper);
-        assert_eq!(objective("shooting", &config), fire);
-        assert_eq!(objective("known/shooting/explore", &config), entropy);
-        let of_beam = objective("beam", &config);
+        assert_eq!(objective("shooting"), fire);
+        assert_eq!(objective("known/shooting/explore"), entropy);
+        let of_beam = objective("beam");
         assert_eq!(of_beam.coverage_bonus, BEAM_BONUS);
         let choices = network_choices(3);
-        assert_eq!(choices[2].objective(0, &config), fire);
-        assert_eq!(choices[3].objective(0, &config), entropy);
-    }
-
-    #[test]
-    fn settings_of_the_objective_reach_the_policies() {
-        let mut config = AgentConfig::default();
-        config.objective.shooting_bonus = 3.0;
+        assert_eq!(choices[2].objective(0), fire);
+        assert_eq!(choices[3].objective(0), entropy);
         for (name, bonus, target) in [
-            ("known/shooting/explore", 3.0, Target::Entropy),
-            ("known/shooting/latent", 3.0, Target::State(1)),
+            ("known/shooting/latent", 1.0, Target::State(1)),
             ("known/shooting/exploit_only", 0.0, Target::State(2)),
-            ("beam", 0.02, Target::State(2)),
             ("coverage", 1.0, Target::Coverage),
         ] {
-            let got = objective(name, &config);
+            let got = objective(name);
             assert_eq!((got.coverage_bonus, got.target), (bonus, target), "{name}");
         }
     }

@@ -1,7 +1,8 @@
 //! Kinds of planner, which find a policy's paths. Each kind is a constant in this file, with an entry in [`PLANNERS`].
 
 use super::goals::{GOALS, GoalEntry, OPTION_GOALS};
-use crate::config::{AgentConfig, ObjectiveConfig};
+use crate::config::AgentConfig;
+use emberwatch_belief::planning::objective::BEAM_BONUS;
 use emberwatch_belief::planning::{Ahead, BeamSearch, Planner, RandomWalk, Shooting};
 use std::fmt;
 
@@ -15,7 +16,7 @@ pub struct PlannerKind {
     /// Short description.
     pub about: &'static str,
     /// Returns the bonus for a new cell, in addition to the goal's value.
-    pub bonus: fn(&ObjectiveConfig) -> f32,
+    pub bonus: f32,
     /// The goals that it accepts, besides options or the states of the model. Empty if it ignores the values of cells.
     pub goals: &'static [GoalEntry],
     pub build: fn(&AgentConfig) -> Box<dyn Planner + Send>,
@@ -25,7 +26,7 @@ pub struct PlannerKind {
 pub const RANDOM: PlannerKind = PlannerKind {
     name: "random",
     about: "random moves, the paper's baseline; without a goal",
-    bonus: |objective| objective.shooting_bonus,
+    bonus: 1.0,
     goals: &[],
     build: |_| Box::new(RandomWalk),
 };
@@ -34,7 +35,7 @@ pub const RANDOM: PlannerKind = PlannerKind {
 pub const SHOOTING: PlannerKind = PlannerKind {
     name: "shooting",
     about: "the best of random paths, as in the paper",
-    bonus: |objective| objective.shooting_bonus,
+    bonus: 1.0,
     goals: GOALS,
     build: |config| {
         let (n_samples, integration) = (config.shooting_samples, config.shooting_integration);
@@ -45,7 +46,7 @@ pub const SHOOTING: PlannerKind = PlannerKind {
 pub const BEAM: PlannerKind = PlannerKind {
     name: "beam",
     about: "beam search",
-    bonus: |objective| objective.beam_bonus,
+    bonus: BEAM_BONUS,
     goals: GOALS,
     build: |config| Box::new(BeamSearch::new(config.beam_width)),
 };

@@ -11,8 +11,8 @@ use emberwatch_belief::estimation::scoring::{Score, score};
 use emberwatch_belief::planning::options::choose_by_rule;
 use emberwatch_belief::planning::team::{ROUNDS, plan_team};
 use emberwatch_belief::planning::{
-    BasisKind, CellValues, Memory, OPTIONS, Objective, OptionPlanner, PathOption, Plan, Planner,
-    Proposal, RandomWalk, Target, ValueLayers,
+    CellValues, Memory, OPTIONS, Objective, OptionPlanner, PathOption, Plan, Planner, Proposal,
+    RandomWalk, Target, ValueLayers,
 };
 use emberwatch_messages::agent_belief::Intent;
 use emberwatch_model::{Airspace, Cell, Frame, Grid};
@@ -30,9 +30,6 @@ pub struct Agent {
     policy: Policy,
     chooser: Chooser,
     estimator: Box<dyn Estimator>,
-    pub(crate) basis: BasisKind,
-    /// The last estimate p_k, if paths are planned on it.
-    estimate: Option<Belief>,
     planner: Box<dyn Planner + Send>,
     options: OptionPlanner,
     pub memory: Memory,
@@ -53,23 +50,19 @@ pub enum Chooser {
     Objective(Objective),
     /// A DQN, which reads the estimator after its prediction (paper eq. 17).
     Network(Decider),
-    Options(OptionChooser),
-}
-
-pub type Decider = Box<dyn Fn(&dyn Estimator) -> Objective + Send>;
-
-/// Chooses among options.
-pub enum OptionChooser {
-    Always(&'static PathOption),
+    /// Always the same option.
+    Option(&'static PathOption),
+    /// The option that a hand-written rule chooses.
     Rule,
     /// The option whose features have the highest value under a DQN.
     Scorer(Arc<Dqn>),
 }
 
+pub type Decider = Box<dyn Fn(&dyn Estimator) -> Objective + Send>;
+
 /// The parts of an agent besides its estimator and its policy.
 pub struct Setup {
     pub chooser: Chooser,
-    pub basis: BasisKind,
     /// Width of the beam search that plans options.
     pub beam_width: usize,
     pub state_names: Vec<String>,
@@ -101,8 +94,6 @@ impl Agent {
             chooser: setup.chooser,
             memory: Memory::new(estimator.belief().shape()),
             estimator,
-            basis: setup.basis,
-            estimate: None,
             planner: (policy.planner.build)(config),
             options: OptionPlanner::new(setup.beam_width),
             target: setup.target,
@@ -129,7 +120,7 @@ impl Agent {
         let objective = match &self.chooser {
             Chooser::Objective(objective) => *objective,
             Chooser::Network(decide) => decide(&*self.estimator),
-            Chooser::Options(_) => return self.plan_options(robots),
+            _ => return self.plan_options(robots),
         };
         self.plan_for(objective, robots, step)
     }
@@ -141,7 +132,7 @@ impl Agent {
         } else {
             objective.target.label(&self.state_names)
         };
-        let values = objective.values_in(self.basis_belief(), &self.airspace);
+        let values = objective.values_in(self.belief(), &self.airspace);
         self.plan_values(&values, &aim, robots, step)
     }
 
@@ -158,15 +149,6 @@ impl Agent {
         plan_team(planner, values, robots, self.n_moves, random, ROUNDS)
     }
 
-    /// Plans paths as [`Self::plan`] does, but on the given belief instead of the agent's belief.
-    #[cfg(test)]
-    pub(crate) fn plan_on(&mut self, belief: &Belief, robots: &[Cell], step: u64) -> Vec<Plan> {
-        let own = self.estimate.replace(belief.clone());
-        let plans = self.plan(robots, step);
-        self.estimate = own;
-        plans
-    }
-
     /// Plans all options from a robot's cell. Each proposal contains the path and the features of one option.
     pub fn propose(&mut self, robot: Cell) -> Vec<Proposal> {
         self.options.propose(&self.layers(), robot)
@@ -180,13 +162,8 @@ impl Agent {
 
     /// Computes the layers of cell values from which options are planned.
     fn layers(&self) -> ValueLayers {
-        let (belief, air) = (self.basis_belief(), &self.airspace);
+        let (belief, air) = (self.belief(), &self.airspace);
         ValueLayers::new(belief, air, self.target, &self.memory, self.n_moves)
-    }
-
-    /// Returns the belief that paths are planned on.
-    pub fn basis_belief(&self) -> &Belief {
-        self.estimate.as_ref().unwrap_or(self.estimator.belief())
     }
 
     /// Plans an option for each robot in turn. Cells that an earlier robot visits have no value for later robots.
@@ -205,8 +182,8 @@ impl Agent {
 
     fn plan_option(&mut self, layers: &ValueLayers, robot: Cell) -> Plan {
         let option = match &self.chooser {
-            Chooser::Options(OptionChooser::Always(option)) => option,
-            Chooser::Options(OptionChooser::Scorer(scorer)) => {
+            Chooser::Option(option) => option,
+            Chooser::Scorer(scorer) => {
                 let mut proposals = self.options.propose(layers, robot);
                 let features: Vec<f32> = proposals.iter().flat_map(|it| it.features).collect();
                 let best = scorer.best(&features);
@@ -223,7 +200,7 @@ impl Agent {
     pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = RANDOM_MOVES.into();
         let new_cells = Objective::new(Target::Coverage);
-        let values = new_cells.values_in(self.estimator.belief(), &self.airspace);
+        let values = new_cells.values_in(self.belief(), &self.airspace);
         let (planner, random) = (&mut RandomWalk, (self.seed, step));
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
@@ -263,9 +240,6 @@ impl Agent {
         let mut together = None;
         let mut estimators = Vec::new();
         for agent in agents {
-            if agent.basis == BasisKind::Estimate {
-                agent.estimate = Some(agent.estimator.belief().clone());
-            }
             together = agent.traits().predict_together;
             estimators.push(&mut *agent.estimator);
         }

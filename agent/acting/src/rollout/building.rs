@@ -1,14 +1,13 @@
 //! Builds a policy's agent from its belief, its planner and its chooser.
 
-use super::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
+use super::agent::{Agent, Chooser, Decider, Setup};
 use crate::beliefs::autoencoder::{AutoencoderEstimator, AutoencoderModel};
 use crate::beliefs::{Conditions, WorldForm, cast};
 use crate::config::AgentConfig;
 use crate::learned::Learned;
 use crate::policy::{BY_OPTIONS, Goal, Policy, network_choices};
 use anyhow::{Context, Result};
-use emberwatch_belief::planning::{BasisKind, Objective};
-use std::sync::Arc;
+use emberwatch_belief::planning::Objective;
 
 /// Checks that a policy can act in worlds of the given form with the given checkpoints.
 ///
@@ -37,8 +36,7 @@ pub fn agent(
     let target = belief.target(conditions)?;
     let setup = Setup {
         airspace: model.airspace(shape)?,
-        chooser: chooser(policy, config, learned, target)?,
-        basis: basis(policy, config, learned)?,
+        chooser: chooser(policy, learned, target)?,
         beam_width: if policy.chooses_options() {
             policy.decisions(learned)?.beam_width
         } else {
@@ -52,49 +50,33 @@ pub fn agent(
     Ok(Agent::new(estimator, policy, config, setup))
 }
 
-/// Returns the belief that a policy plans on, the estimate or the predictor. A policy with a DQN uses the belief that
-/// was used in the DQN's training, because the DQN's values depend on it. For all other policies, the settings
-/// decide.
-fn basis(policy: &Policy, config: &AgentConfig, learned: &Learned) -> Result<BasisKind> {
-    Ok(match policy.goal {
-        Goal::Learned if policy.chooses_options() => policy.decisions(learned)?.basis,
-        Goal::Learned => network(learned)?.basis,
-        _ => config.objective.belief,
-    })
-}
-
-fn chooser(
-    policy: &Policy,
-    config: &AgentConfig,
-    learned: &Learned,
-    target: usize,
-) -> Result<Chooser> {
+fn chooser(policy: &Policy, learned: &Learned, target: usize) -> Result<Chooser> {
     if *policy.planner == BY_OPTIONS {
-        return Ok(Chooser::Options(match policy.goal {
-            Goal::Option(option) => OptionChooser::Always(option),
-            Goal::Learned => OptionChooser::Scorer(policy.decisions(learned)?.scorer.clone()),
-            _ => OptionChooser::Rule,
-        }));
+        return Ok(match policy.goal {
+            Goal::Option(option) => Chooser::Option(option),
+            Goal::Learned => Chooser::Scorer(policy.decisions(learned)?.scorer.clone()),
+            _ => Chooser::Rule,
+        });
     }
     Ok(match policy.goal {
-        Goal::Learned => Chooser::Network(decider(config, network(learned)?)),
-        _ => Chooser::Objective(policy.objective(target, config)),
+        Goal::Learned => {
+            let network = learned.get::<AutoencoderModel>();
+            let missing = "checkpoint: expected a learned autoencoder, got none";
+            Chooser::Network(decider(network.context(missing)?))
+        }
+        _ => Chooser::Objective(policy.objective(target)),
     })
-}
-
-fn network(learned: &Learned) -> Result<Arc<AutoencoderModel>> {
-    let network = learned.shared::<AutoencoderModel>();
-    network.context("checkpoint: expected a learned autoencoder, got none")
 }
 
 /// Returns a function that chooses an objective with the DQN of Algorithm 1, which was trained with an autoencoder.
-fn decider(config: &AgentConfig, network: Arc<AutoencoderModel>) -> Decider {
+fn decider(network: &AutoencoderModel) -> Decider {
     let choices = network_choices(network.autoencoder.shape().n_states).into_iter();
-    let objectives = choices.map(|choice| choice.objective(network.target, config));
+    let objectives = choices.map(|choice| choice.objective(network.target));
     let objectives: Vec<Objective> = objectives.collect();
+    let dqn = network.dqn.clone();
     Box::new(move |estimator| {
         let hidden = cast::<AutoencoderEstimator>(estimator).hidden();
-        objectives[network.dqn.best(hidden)]
+        objectives[dqn.best(hidden)]
     })
 }
 

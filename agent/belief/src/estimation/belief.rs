@@ -9,7 +9,6 @@ use emberwatch_model::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
 use ndarray::{ArrayView2, ArrayView3, Axis};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
-use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Maximum deviation from 1 of the sum of a cell's probabilities: about 400 times the rounding error of an `f32`. The
@@ -21,17 +20,6 @@ const SUM_TOLERANCE: f32 = 5e-5;
 pub struct Belief {
     probabilities: Probabilities,
     shape: Shape,
-}
-
-/// A definition of a cell's entropy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum EntropyKind {
-    /// The Shannon entropy in nats, `-sum_m p_m log p_m` (eq. 14). It is at most `log S`.
-    #[default]
-    Sum,
-    /// The mean over the S terms, as in the authors' code: `1/S` of [`EntropyKind::Sum`].
-    Mean,
 }
 
 /// The reason why an array is not a valid belief.
@@ -175,12 +163,18 @@ impl Belief {
         self.probabilities.index_axis(Axis(0), state)
     }
 
-    /// Computes the entropy of each cell in nats (eq. 14), shape `[H, W]`. `0 log 0` counts as 0.
-    pub fn entropy(&self, kind: EntropyKind) -> Grid<f32> {
-        let scale = match kind {
-            EntropyKind::Sum => -1.0,
-            EntropyKind::Mean => -1.0 / self.n_states() as f32,
-        };
+    /// Computes the Shannon entropy of each cell in nats, `-sum_m p_m log p_m` (eq. 14), shape `[H, W]`. It is at most
+    /// `log S`. `0 log 0` counts as 0.
+    pub fn entropy(&self) -> Grid<f32> {
+        self.scaled_entropy(-1.0)
+    }
+
+    /// Computes the mean of the entropy's S terms, as in the authors' code: `1/S` of [`Self::entropy`].
+    pub fn mean_entropy(&self) -> Grid<f32> {
+        self.scaled_entropy(-1.0 / self.n_states() as f32)
+    }
+
+    fn scaled_entropy(&self, scale: f32) -> Grid<f32> {
         let mut entropy = vec![0.0; self.shape.n_cells()];
         for plane in self.as_slice().chunks_exact(entropy.len()) {
             for (sum, &p) in entropy.iter_mut().zip(plane) {
@@ -283,16 +277,18 @@ mod tests {
 
     #[test]
     fn entropy_of_known_distributions() {
-        let entropy = |belief: &Belief, kind| {
-            let entropy = belief.entropy(kind);
-            assert!(entropy.iter().all(|h| *h == entropy[[0, 0]]), "{entropy}");
-            entropy[[0, 0]]
-        };
         let (uniform, ln3) = (Belief::uniform(3, shape(2, 5)), 3.0_f32.ln());
-        assert!((entropy(&uniform, EntropyKind::Sum) - ln3).abs() < 1e-6);
-        assert!((entropy(&uniform, EntropyKind::Mean) - ln3 / 3.0).abs() < 1e-6);
+        for (entropy, expected) in [
+            (uniform.entropy(), ln3),
+            (uniform.mean_entropy(), ln3 / 3.0),
+        ] {
+            assert!(
+                entropy.iter().all(|h| (h - expected).abs() < 1e-6),
+                "{entropy}"
+            );
+        }
         let certain = Belief::from_states(&Grid::from_elem((2, 5), 1), 3).expect("valid states");
-        assert_eq!(entropy(&certain, EntropyKind::Sum), 0.0);
+        assert!(certain.entropy().iter().all(|h| *h == 0.0));
     }
 
     #[test]

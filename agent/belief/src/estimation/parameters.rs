@@ -10,7 +10,6 @@ use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES, Shape};
 use ndarray::{Array2, Array4};
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 /// Maximum magnitude of an unconstrained value. With this bound, weights are at least 1e-7 and probabilities at least
 /// 1e-14.
@@ -43,11 +42,10 @@ pub struct Dimensions {
 
 /// Three tensors in the order of [`Parameters::NAMES`], which contain unconstrained values, the gradients of these
 /// values, or their Adam moments.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
     pub dimensions: Dimensions,
     /// `[S, S, KH, KW]`, `[S, O]`, and `[S]`, row-major.
-    #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
 }
 
@@ -63,41 +61,30 @@ pub struct Tables {
     pub initial: Vec<f32>,
 }
 
-/// An error about dimensions that are out of range.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[non_exhaustive]
-pub enum DimensionsError {
-    #[error("learned filter: {name}: expected {least} to {MAX_VALUES}, got {got}")]
-    Count {
-        name: &'static str,
-        least: usize,
-        got: usize,
-    },
-    #[error(
-        "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
-    )]
-    Kernel { height: usize, width: usize },
-}
-
 impl Dimensions {
     /// Checks the dimensions against the limits of a model, and returns them.
     ///
     /// # Errors
     /// If a dimension is out of range. The error names the first such dimension.
-    pub fn check(self) -> Result<Self, DimensionsError> {
+    pub fn check(self) -> Result<Self, String> {
         let counts = [
             ("states", 2, self.n_states),
             ("observations", 1, self.n_observations),
         ];
         for (name, least, got) in counts {
             if !(least..=MAX_VALUES).contains(&got) {
-                return Err(DimensionsError::Count { name, least, got });
+                let expected = format!("{least} to {MAX_VALUES}");
+                return Err(format!(
+                    "learned filter: {name}: expected {expected}, got {got}"
+                ));
             }
         }
         let is_side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
         let (height, width) = self.kernel;
         if !(is_side(height) && is_side(width)) {
-            return Err(DimensionsError::Kernel { height, width });
+            return Err(format!(
+                "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
+            ));
         }
         Ok(self)
     }
@@ -337,7 +324,7 @@ mod tests {
         for (change, words) in changes {
             let mut dimensions = dimensions();
             change(&mut dimensions);
-            let error = dimensions.check().expect_err(words).to_string();
+            let error = dimensions.check().expect_err(words);
             assert!(error.contains(words), "{error}");
         }
     }

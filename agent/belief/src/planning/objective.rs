@@ -1,12 +1,11 @@
 //! Objectives, the goals of planned paths. An [`Objective`] and a belief determine [`CellValues`], which planners
 //! maximise. These values are the costs `c_1` and `c_2` of paper eqs. 13 and 14 with the opposite sign.
 
-use crate::estimation::belief::{Belief, EntropyKind};
+use crate::estimation::belief::Belief;
 use emberwatch_model::Airspace;
 use emberwatch_model::grid::{Cell, Grid, Shape};
 use emberwatch_model::path::Move;
 use ndarray::ArrayView2;
-use serde::{Deserialize, Serialize};
 
 /// Bonus of beam search for each distinct cell, in addition to its probability.
 ///
@@ -15,16 +14,6 @@ use serde::{Deserialize, Serialize};
 /// makes no difference (36.4 and 36.6). All rewards were measured on 8 training worlds with burn-in 25,000 over 1,500
 /// steps.
 pub const BEAM_BONUS: f32 = 0.02;
-
-/// The belief on which paths are planned.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum BasisKind {
-    /// The predictor `u_{k+1}` of the states that the path will observe, as in the authors' code.
-    Predictor,
-    /// The estimate `p_k` of the current states, as printed in the paper (eqs. 13 to 15).
-    Estimate,
-}
 
 /// The quantity that a path collects at its cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -57,7 +46,6 @@ impl Target {
 pub struct Objective {
     pub target: Target,
     pub coverage_bonus: f32,
-    pub entropy: EntropyKind,
 }
 
 /// The value that a planner assigns to each cell of the grid. All values are finite.
@@ -80,16 +68,14 @@ impl Objective {
         Self {
             target,
             coverage_bonus,
-            entropy: EntropyKind::Sum,
         }
     }
 
-    /// Creates the objective of the authors' code, with a bonus of 1 per distinct cell and [`EntropyKind::Mean`].
+    /// Creates the objective of the authors' code, with a bonus of 1 per distinct cell.
     pub fn paper(target: Target) -> Self {
         Self {
             target,
             coverage_bonus: 1.0,
-            entropy: EntropyKind::Mean,
         }
     }
 
@@ -107,7 +93,7 @@ impl Objective {
     pub fn values_in(&self, belief: &Belief, airspace: &Airspace) -> CellValues {
         let value = match self.target {
             Target::State(state) => belief.probability(state).to_owned(),
-            Target::Entropy => belief.entropy(self.entropy),
+            Target::Entropy => belief.mean_entropy(),
             Target::Coverage => Grid::zeros(belief.shape().dim()),
         };
         let values = CellValues::new(value, self.coverage_bonus);

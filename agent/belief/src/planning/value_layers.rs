@@ -1,6 +1,6 @@
 //! The prospects of a robot: layers of values per cell, such as probability and novelty, and their sums over regions.
 
-use crate::estimation::belief::{Belief, EntropyKind};
+use crate::estimation::belief::Belief;
 use crate::planning::memory::{Memory, Recent};
 use emberwatch_model::{Airspace, Cell, Grid, Shape};
 use ndarray::Zip;
@@ -72,7 +72,7 @@ impl ValueLayers {
         let greatest = (belief.n_states() as f32).ln().max(f32::MIN_POSITIVE);
         let probability = belief.probability(target).to_owned();
         let surplus = probability.mapv(|p| (p - LIKELY).max(0.0));
-        let entropy = belief.entropy(EntropyKind::Sum) / greatest;
+        let entropy = belief.entropy() / greatest;
         let layers = [probability, surplus, entropy, memory.novelty()];
         let layers = Self {
             airspace: airspace.clone(),

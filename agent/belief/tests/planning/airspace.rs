@@ -27,7 +27,7 @@ fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]])
     let shape = air.shape();
     let value = |at: (usize, usize)| match objective.target {
         Target::State(state) => field.belief.probability(state)[at],
-        Target::Entropy => field.belief.entropy(objective.entropy)[at],
+        Target::Entropy => field.belief.mean_entropy()[at],
         Target::Coverage => 0.0,
     };
     let radius = match objective.target {

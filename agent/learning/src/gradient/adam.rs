@@ -2,6 +2,9 @@
 
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 
+/// Decay rates of the two moments.
+const BETAS: [f64; 2] = [0.9, 0.99];
+
 /// A constant added to the square root of the second moment, as in the Adam paper.
 const EPSILON: f64 = 1e-8;
 
@@ -21,18 +24,12 @@ impl Adam {
         }
     }
 
-    /// Makes one step. `rates` contains the step size of each tensor, and the betas are the decay rates of the two
-    /// moments.
-    pub fn step(
-        &mut self,
-        parameters: &mut Parameters,
-        gradient: &Parameters,
-        rates: [f64; 3],
-        [beta1, beta2]: [f64; 2],
-    ) {
+    /// Makes one step. `rates` contains the step size of each tensor.
+    pub fn step(&mut self, parameters: &mut Parameters, gradient: &Parameters, rates: [f64; 3]) {
+        let [beta1, beta2] = BETAS;
         self.n_steps += 1;
         let steps = self.n_steps.min(1 << 30) as i32;
-        let corrections = [beta1, beta2].map(|beta| 1.0 - beta.powi(steps));
+        let corrections = BETAS.map(|beta| 1.0 - beta.powi(steps));
         for (tensor, rate) in rates.into_iter().enumerate() {
             let moments = self.first.tensors[tensor]
                 .iter_mut()
@@ -65,9 +62,9 @@ mod tests {
         let mut parameters = Parameters::zeros(dimensions);
         let mut gradient = Parameters::zeros(dimensions);
         gradient.tensors[0] = vec![3.0, -0.2, 0.0, 1.0];
-        let (rates, betas) = ([0.5, 0.1, 0.1], [0.9, 0.99]);
+        let rates = [0.5, 0.1, 0.1];
         let mut adam = Adam::new(dimensions);
-        adam.step(&mut parameters, &gradient, rates, betas);
+        adam.step(&mut parameters, &gradient, rates);
         let close = |got: &[f32], expected: &[f32]| {
             let near = got.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6);
             assert!(near, "{got:?} {expected:?}");
@@ -76,7 +73,7 @@ mod tests {
         // The second gradient is -g: the mean is (.9 * .1 - .1) g = -.01 g, divided by 1 - .81. The mean square is g^2
         // again.
         gradient.tensors[0] = vec![-3.0, 0.2, 0.0, -1.0];
-        adam.step(&mut parameters, &gradient, rates, betas);
+        adam.step(&mut parameters, &gradient, rates);
         let back = 0.5 * 0.01 / 0.19;
         close(&parameters.tensors[0][..2], &[-0.5 + back, 0.5 - back]);
     }

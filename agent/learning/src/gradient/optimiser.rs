@@ -20,6 +20,9 @@ use rayon::prelude::*;
 /// order of summation do not depend on the number of threads.
 const N_PARTS: usize = 8;
 
+/// Weight, per cell, of the prior that the state with the highest reward is observed almost surely.
+const ANCHOR: f64 = 0.001;
+
 /// The parameters, and everything else that a later update depends on, except the replay buffer.
 #[derive(Debug, Clone)]
 pub struct Optimiser {
@@ -206,7 +209,7 @@ impl Optimiser {
         }
     }
 
-    /// Adds the gradient of the negative log-prior `-anchor * ln P(y | x)`, where y is the most likely observation of
+    /// Adds the gradient of the negative log-prior `-ANCHOR * ln P(y | x)`, where y is the most likely observation of
     /// state x. The paper assumes that "there is a state which is observable with negligible uncertainties" (section
     /// III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
@@ -215,7 +218,7 @@ impl Optimiser {
         let row = &likelihood[state * n_observations..][..n_observations];
         let shown = (0..n_observations).max_by(|&a, &b| row[a].total_cmp(&row[b]));
         if let Some(shown) = shown {
-            by_likelihood[state * n_observations + shown] -= self.config.anchor / row[shown];
+            by_likelihood[state * n_observations + shown] -= ANCHOR / row[shown];
         }
     }
 
@@ -228,9 +231,8 @@ impl Optimiser {
         let rate = self.config.rate * self.config.rate_at(number - 1);
         let observation_rate = rate * self.config.observation_rate;
         let rates = [rate, observation_rate, observation_rate];
-        let betas = [self.config.beta1, self.config.beta2];
         let (mut parameters, mut adam) = (self.parameters.clone(), self.adam.clone());
-        adam.step(&mut parameters, &gradient, rates, betas);
+        adam.step(&mut parameters, &gradient, rates);
         if let Some(tensor) = parameters.not_finite() {
             return Err(self.wrong(tensor, "a NaN or infinite step"));
         }

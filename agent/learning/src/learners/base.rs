@@ -55,6 +55,21 @@ impl PartialEq for LearnerKind {
     }
 }
 
+impl LearnerKind {
+    /// Returns the default number of worlds of a training.
+    pub fn n_worlds(&self) -> u32 {
+        if self.is_single { 1 } else { 16 }
+    }
+
+    /// Returns the number of world steps of a training that another one or a suite needs. 0 means that there is none.
+    pub fn full_steps(&self, config: &AgentConfig) -> u64 {
+        match (self.steps)(config) {
+            0 if !self.is_single => config.decisions.filter_steps,
+            steps => steps,
+        }
+    }
+}
+
 impl fmt::Debug for LearnerKind {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(self.name)
@@ -101,8 +116,7 @@ impl Worlds {
         self.airspace.shape()
     }
 
-    /// Creates an agent whose belief has not been corrected yet. `target` is the index of the state with the highest
-    /// reward.
+    /// Creates an agent at its first observation. `target` is the index of the state with the highest reward.
     pub(super) fn new_agent(
         &self,
         config: &AgentConfig,
@@ -110,19 +124,18 @@ impl Worlds {
         estimator: Box<dyn Estimator>,
         state_names: Vec<String>,
         observation: Observation,
-    ) -> ActingAgent {
+    ) -> Result<ActingAgent> {
         let setup = Setup {
             airspace: self.airspace.clone(),
-            basis: config.objective.belief,
             beam_width: config.decisions.beam_width,
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),
             target,
-            chooser: Chooser::Objective(policy.objective(target, config)),
+            chooser: Chooser::Objective(policy.objective(target)),
         };
         let agent = Agent::new(estimator, policy, config, setup);
-        ActingAgent::new(agent, AgentObservation::new([observation]))
+        ActingAgent::begun(agent, AgentObservation::new([observation]))
     }
 }
 
@@ -147,16 +160,8 @@ pub trait Learner: Actor {
 
     fn n_updates(&self) -> u64;
 
-    /// Explains why a run with this number of steps made no update, and what to do.
-    fn lacks(&self, steps: u64) -> String;
-
     /// Returns what was learned, for a checkpoint from which a later run can resume.
     fn contents(&self) -> Result<Contents>;
-}
-
-/// Explains that a run was too short for an update. `name` is the name of the setting for updates per step.
-pub(super) fn lacks_steps(name: &str, updates_per_step: f64) -> String {
-    format!("too few for an update at {name} = {updates_per_step}; train for more --steps")
 }
 
 /// Puts a robot's run in its place, and returns the run of its last episode.

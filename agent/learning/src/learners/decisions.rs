@@ -11,7 +11,7 @@ pub use self::saved::{SHAPE, SavedDecisions};
 use self::run::{Held, Run, features};
 use self::saved::SavedBelief;
 use crate::checkpoint::{Contents, check};
-use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, lacks_steps, replace};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
 use crate::learners::update::ModelUpdate;
 use anyhow::Result;
 use emberwatch_acting::config::AgentConfig;
@@ -98,12 +98,12 @@ impl DecisionsLearner {
         Ok(learner)
     }
 
-    /// Creates an agent whose belief has not been corrected yet.
+    /// Creates an agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let (base, names) = (&self.base, self.base.state_names.clone());
         let (config, policy) = (&self.config, (&self.policy, self.base.target));
         let (estimator, worlds) = (base.estimator()?, &self.worlds);
-        Ok(worlds.new_agent(config, policy, estimator, names, observation))
+        worlds.new_agent(config, policy, estimator, names, observation)
     }
 
     /// Chooses the option that a robot flies: the option with the highest value, or a random option that it keeps for
@@ -188,10 +188,7 @@ impl Actor for DecisionsLearner {
 
 impl Learner for DecisionsLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let mut acting = self.agent_at(observation)?;
-        acting.correct()?;
-        acting.agent.predict();
-        let run = Run::begun(acting, &self.dqn);
+        let run = Run::begun(self.agent_at(observation)?, &self.dqn);
         if let Some(mut ended) = replace(&mut self.runs, &self.worlds, robot, run) {
             let transitions = ended.end(&self.dqn).into_iter();
             transitions.for_each(|transition| self.dqn.remember(transition));
@@ -229,18 +226,6 @@ impl Learner for DecisionsLearner {
 
     fn n_updates(&self) -> u64 {
         self.dqn.n_updates()
-    }
-
-    fn lacks(&self, _: u64) -> String {
-        let (batch, n) = (self.dqn.settings().batch, self.dqn.remembered().len());
-        if n < batch {
-            return format!(
-                "an update learns from {batch} transitions, and the steps yielded {n}; train for more --steps, or with \
-                 a smaller decisions.batch"
-            );
-        }
-        let rate = self.config.decisions.updates_per_step;
-        lacks_steps("decisions.updates_per_step", rate)
     }
 
     fn contents(&self) -> Result<Contents> {

@@ -79,7 +79,7 @@ fn dimensions(config: &AgentConfig, worlds: &Worlds) -> Result<Dimensions> {
         n_observations: worlds.n_observations,
         kernel: (learning.kernel[0], learning.kernel[1]),
     };
-    Ok(dimensions.check()?)
+    dimensions.check().map_err(anyhow::Error::msg)
 }
 
 impl FilterLearner {
@@ -102,8 +102,8 @@ impl FilterLearner {
         })
     }
 
-    /// Creates a robot's agent, whose belief has not been corrected yet.
-    fn agent_at(&self, observation: Observation) -> ActingAgent {
+    /// Creates a robot's agent at its first observation.
+    fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));
         let names = numbered_states(tables.dimensions.n_states);
@@ -133,7 +133,7 @@ impl Actor for FilterLearner {
         self.learned = self.fit.learned();
         let (n_walking, tables) = (self.n_walking(), &self.learned.tables);
         let policy = Policy::exploiting(&LEARNED);
-        let objective = policy.objective(self.learned.target, &self.config);
+        let objective = policy.objective(self.learned.target);
         let agents = self.agents.iter_mut().enumerate();
         self.planned = in_parallel(agents, |(index, acting)| {
             let belief = acting.agent.belief().clone();
@@ -180,9 +180,7 @@ impl Learner for FilterLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
         self.fit.start_track(robot);
         self.fit.see(robot, &observation.frame, None, &self.learned);
-        let mut acting = self.agent_at(observation);
-        acting.correct()?;
-        acting.agent.predict();
+        let acting = self.agent_at(observation)?;
         replace(&mut self.agents, &self.worlds, robot, acting);
         Ok(())
     }
@@ -207,10 +205,6 @@ impl Learner for FilterLearner {
 
     fn n_updates(&self) -> u64 {
         self.fit.n_updates()
-    }
-
-    fn lacks(&self, steps: u64) -> String {
-        self.fit.lacks(steps)
     }
 
     fn contents(&self) -> Result<Contents> {

@@ -201,7 +201,7 @@ impl NetworkLearner {
 impl Actor for NetworkLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let mut decision = self.decide();
-        let objective = self.choices[decision.action].objective(0, &self.config);
+        let objective = self.choices[decision.action].objective(0);
         let acting = self.at_world_mut();
         let (cells, step) = (acting.cells(), acting.step());
         decision.path = acting
@@ -248,11 +248,8 @@ impl Learner for NetworkLearner {
         let names = numbered_states(network.shape().n_states);
         // The initial policy is the first choice, whose target is the first state.
         let (first, worlds) = ((&self.choices[0], 0), &self.worlds);
-        let mut acting =
-            worlds.new_agent(&self.config, first, Box::new(estimator), names, observation);
-        acting.correct()?;
-        acting.agent.predict();
-        self.acting = Some(acting);
+        let acting = worlds.new_agent(&self.config, first, Box::new(estimator), names, observation);
+        self.acting = Some(acting?);
         Ok(())
     }
 
@@ -291,15 +288,6 @@ impl Learner for NetworkLearner {
 
     fn n_updates(&self) -> u64 {
         self.progress.autoencoder.n_updates()
-    }
-
-    fn lacks(&self, _: u64) -> String {
-        format!(
-            "an update learns from a window of {} frames of one episode that show some cell twice, and there was no \
-             such window; train for more --steps, on longer episodes (--max-steps of the server), or with a smaller \
-             autoencoder.window",
-            self.config.autoencoder.window
-        )
     }
 
     fn contents(&self) -> Result<Contents> {

@@ -9,7 +9,7 @@ mod replay;
 use self::behaviour::Behaviour;
 use self::replay::LessonReplay;
 use crate::checkpoint::{Contents, check, check_counts};
-use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, lacks_steps, replace};
+use crate::learners::base::{Learner, LearnerInputs, LearnerKind, Worlds, replace};
 use crate::learners::update::ModelUpdate;
 use crate::models::{SavedNeural, SavedNeuralModel, corrected_tensors};
 use crate::reward::{RewardEstimate, met};
@@ -110,20 +110,15 @@ impl NeuralLearner {
         self.reward.target().unwrap_or(last)
     }
 
-    /// Creates a robot's agent, whose belief has not been corrected yet.
+    /// Creates a robot's agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let filter = self.filter.as_deref();
         let estimator = estimator(&self.network, filter, self.worlds.shape())?;
         let names = numbered_states(self.worlds.n_observations);
         let (policy, target) = (Policy::exploiting(&BELIEF), self.paying());
         let (estimator, worlds) = (Box::new(estimator), &self.worlds);
-        Ok(worlds.new_agent(
-            &self.config,
-            (&policy, target),
-            estimator,
-            names,
-            observation,
-        ))
+        let policy = (&policy, target);
+        worlds.new_agent(&self.config, policy, estimator, names, observation)
     }
 
     /// Returns the completed fraction of the training steps.
@@ -158,7 +153,7 @@ impl NeuralLearner {
 impl Actor for NeuralLearner {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let (target, first) = (self.paying(), self.worlds.numbers.start);
-        let objective = Policy::exploiting(&BELIEF).objective(target, &self.config);
+        let objective = Policy::exploiting(&BELIEF).objective(target);
         let is_exploring = self.progress() < self.config.neural.explore_share;
         let (seed, step) = (self.config.seed, self.world_steps);
         let mut runs = std::mem::take(&mut self.runs);
@@ -169,10 +164,10 @@ impl Actor for NeuralLearner {
             let behaviour =
                 Behaviour::next(run.behaviour, is_exploring, self.worlds.shape(), &mut rng);
             let seen = || self.replay.present(first + index as u32);
-            let (airspace, belief) = (&self.worlds.airspace, agent.basis_belief());
+            let (airspace, belief) = (&self.worlds.airspace, agent.belief());
             let plans = match behaviour.values(objective, airspace, target, belief, seen, &mut rng)
             {
-                Some(values) => agent.plan_values(&values, behaviour.label(), &cells, k),
+                Some(values) => agent.plan_values(&values, "learning", &cells, k),
                 None => agent.walk(&cells, k),
             };
             run.behaviour = Some(behaviour);
@@ -212,14 +207,12 @@ impl Actor for NeuralLearner {
 
 impl Learner for NeuralLearner {
     fn start_episode(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let mut acting = self.agent_at(observation)?;
         self.replay.start_track(robot, self.worlds.shape());
-        let base = base(&acting);
-        self.replay.push(robot, &acting.observation().frame, base);
-        acting.correct()?;
-        acting.agent.predict();
+        let filter = self.filter.as_deref();
+        let before = estimator(&self.network, filter, self.worlds.shape())?;
+        self.replay.push(robot, &observation.frame, before.base());
         let run = Run {
-            acting,
+            acting: self.agent_at(observation)?,
             behaviour: None,
             path: Vec::new(),
         };
@@ -258,14 +251,6 @@ impl Learner for NeuralLearner {
 
     fn n_updates(&self) -> u64 {
         self.network.n_updates()
-    }
-
-    fn lacks(&self, steps: u64) -> String {
-        let rate = self.config.neural.updates_per_step;
-        if (steps as f64) * rate < 1.0 {
-            return lacks_steps("neural.updates_per_step", rate);
-        }
-        "the frames show no cell".into()
     }
 
     fn contents(&self) -> Result<Contents> {

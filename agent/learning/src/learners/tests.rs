@@ -1,8 +1,7 @@
-//! Tests of the belief that learners plan on, and of resuming from checkpoints.
+//! Tests of the transitions that learners remember, of step sizes, and of resuming from checkpoints.
 
 use crate::checkpoint::Contents;
 use crate::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
-use crate::learners::filter::FilterLearner;
 use crate::learners::filter::fit::FilterFit;
 use crate::learners::network::{NetworkLearner, Progress};
 use crate::learners::neural::NeuralLearner;
@@ -15,7 +14,6 @@ use emberwatch_acting::learned::Learned;
 use emberwatch_acting::rollout::AgentObservation;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_messages::observation::Observation;
 use emberwatch_model::randomness::split_mix;
@@ -31,14 +29,12 @@ pub(crate) fn worlds() -> Worlds {
     }
 }
 
-pub(crate) fn config(belief: BasisKind) -> AgentConfig {
-    let mut config = AgentConfig {
+pub(crate) fn config() -> AgentConfig {
+    AgentConfig {
         beam_width: 8,
         shooting_samples: 64,
         ..AgentConfig::default()
-    };
-    config.objective.belief = belief;
-    config
+    }
 }
 
 fn dimensions() -> Dimensions {
@@ -66,44 +62,11 @@ fn observation(step: u64) -> Observation {
     }
 }
 
-/// Makes one step. Returns the posterior after its frame.
-fn take_step(learner: &mut impl Learner, step: u64) -> Belief {
+fn take_step(learner: &mut impl Learner, step: u64) {
     learner.plan();
     let seen = vec![AgentObservation::new([observation(step)])];
     learner.see(seen).expect("possible");
-    let posterior = learner.agent(0).agent.belief().clone();
     learner.predict();
-    posterior
-}
-
-fn check_basis(mut learner: impl Learner, basis: BasisKind) {
-    learner.start_episode(0, observation(0)).expect("possible");
-    let estimate = take_step(&mut learner, 1);
-    let agent = &learner.agent(0).agent;
-    let is_basis = [&estimate, agent.belief()].map(|belief| belief == agent.basis_belief());
-    let is_estimate = basis == BasisKind::Estimate;
-    assert_eq!(
-        is_basis,
-        [is_estimate, !is_estimate],
-        "{:?}",
-        agent.policy()
-    );
-}
-
-#[test]
-fn learners_plan_on_the_configured_belief() {
-    for basis in [BasisKind::Predictor, BasisKind::Estimate] {
-        let config = &config(basis);
-        let learner = FilterLearner::new(None, dimensions(), worlds(), config);
-        check_basis(learner.expect("new"), basis);
-        let progress = Progress::first(&worlds().form(), config, &Device::Cpu);
-        let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
-        check_basis(learner, basis);
-        let learner = NeuralLearner::new(None, None, worlds(), config, &Device::Cpu);
-        check_basis(learner.expect("a network"), basis);
-        let learner = DecisionsLearner::new(known_base(), None, worlds(), config);
-        check_basis(learner.expect("new"), basis);
-    }
 }
 
 /// A base with the known-model filter.
@@ -124,13 +87,13 @@ fn learn(learner: &mut impl Learner, steps: std::ops::Range<u64>) -> Contents {
 
 /// A filter with its initial parameters.
 pub(crate) fn learned_filter() -> LearnedModel {
-    let config = config(BasisKind::Estimate);
+    let config = config();
     FilterFit::new(dimensions(), worlds().shape(), &config).learned()
 }
 
 #[test]
 fn decisions_continue_from_what_was_learned() {
-    let mut config = config(BasisKind::Estimate);
+    let mut config = config();
     let decisions = &mut config.decisions;
     (decisions.learning.batch, decisions.updates_per_step) = (4, 1.0);
     let neural = |filter: Option<LearnedModel>| {
@@ -218,7 +181,7 @@ fn check_transitions(
 
 #[test]
 fn decisions_learn_from_every_step_of_an_episode() {
-    let mut config = config(BasisKind::Estimate);
+    let mut config = config();
     config.decisions.learning.n_step = 4;
     let scale = config.decisions.reward_scale / worlds().n_moves as f32;
     for episode in EPISODES {
@@ -231,7 +194,7 @@ fn decisions_learn_from_every_step_of_an_episode() {
 
 #[test]
 fn the_network_learns_from_every_step_of_an_episode() {
-    let mut config = config(BasisKind::Estimate);
+    let mut config = config();
     config.dqn.learning.n_step = 4;
     for episode in EPISODES {
         let progress = Progress::first(&worlds().form(), &config, &Device::Cpu);
@@ -260,7 +223,7 @@ fn check_rates(mut learner: impl Learner, rate: f64, rate_of: fn(&ModelUpdate) -
 
 #[test]
 fn step_sizes_fall_linearly_to_their_final_value() {
-    let mut config = config(BasisKind::Estimate);
+    let mut config = config();
     let decisions = &mut config.decisions;
     (decisions.learning.batch, decisions.updates_per_step) = (2, 1.0);
     (decisions.steps, decisions.final_rate) = (10, 0.2);
@@ -283,7 +246,7 @@ fn neural(
     filter: Option<&LearnedModel>,
     worlds: Worlds,
 ) -> anyhow::Result<NeuralLearner> {
-    let mut config = config(BasisKind::Estimate);
+    let mut config = config();
     config.neural.steps = 40;
     (config.neural.batch, config.neural.updates_per_step) = (4, 1.0);
     NeuralLearner::new(contents, filter, worlds, &config, &Device::Cpu)

@@ -3,7 +3,6 @@
 use super::track::{Track, Transition};
 use crate::adam::{Adam, AdamSettings};
 use crate::error::NetworkError;
-use crate::tensors::named;
 use crate::variables::{Variables, build, uniform, uniform_init};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::loss::mse;
@@ -12,7 +11,6 @@ use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
-use std::fmt;
 
 /// Settings of a DQN, as stored in files. Files do not contain the optimiser's settings.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -315,10 +313,7 @@ impl Dqn {
     }
 
     fn learn_batch(&mut self, batch: &Batch) -> Result<f32, NetworkError> {
-        let targets = [("dqn.target.", &self.target_variables)];
-        let known: Vec<_> = batch.named().into_iter().chain(named(&targets)).collect();
         let loss = self.loss(batch)?;
-        self.adam.checked(&known, &loss)?;
         let settings = &self.settings.adam;
         let loss = self
             .adam
@@ -379,24 +374,6 @@ impl Batch {
             reward: column(|row| row.reward)?,
             discount: column(|row| row.discount)?,
         })
-    }
-
-    fn named(&self) -> [(String, &Tensor); 4] {
-        [
-            ("dqn.replay.input".into(), &self.input),
-            ("dqn.replay.next".into(), &self.next),
-            ("dqn.replay.reward".into(), &self.reward),
-            ("dqn.replay.discount".into(), &self.discount),
-        ]
-    }
-}
-
-impl fmt::Debug for Dqn {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut debug = f.debug_struct("Dqn");
-        debug.field("settings", &self.settings);
-        debug.field("n_updates", &self.n_updates());
-        debug.finish_non_exhaustive()
     }
 }
 

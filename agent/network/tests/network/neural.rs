@@ -250,6 +250,9 @@ fn numbers_that_are_not_finite_are_named_and_change_nothing() {
     let first = |network: &NeuralBelief| numbers(&network.variables()["full.weight"]);
     let before = first(&network);
     let error = network.update(1e-3, &lessons(2)).expect_err("a NaN");
-    assert!(error.to_string().ends_with("in wide.bias"), "{error}");
+    assert!(
+        error.to_string().ends_with("in wide.bias after the update"),
+        "{error}"
+    );
     assert_eq!((first(&network), network.n_updates()), (before, 0));
 }

@@ -68,11 +68,11 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
     overwrite(&network, "decoder.8.weight", &[f32::NAN]);
     let before = network.variables()["decoder.2.running_mean"].to_vec1::<f32>();
     let error = network.update(&window).expect_err("not finite");
-    let (update, tensor) = (1, "decoder.8.weight".into());
+    let (update, tensor) = (1, "decoder.10.running_mean after the update".into());
     assert_eq!(error, NotFinite { update, tensor }.into());
     let after = network.variables()["decoder.2.running_mean"].to_vec1::<f32>();
     assert_eq!(before.expect("numbers"), after.expect("numbers"));
-    // The parameter is finite, but its gradient is not.
+    // The parameter is finite, but its gradient may not be.
     overwrite(&network, "decoder.8.weight", &[0.0]);
     overwrite(&network, "encoder.13.bias", &[f32::MAX; 16]);
     let before = tensors(&network);

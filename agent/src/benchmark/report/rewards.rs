@@ -1,10 +1,9 @@
-//! Plots rewards over time: a moving average per policy, with standard errors over worlds. The number of burning cells
-//! is shaded in the background.
+//! Plots rewards over time: a moving average per policy, with standard errors over worlds.
 
 use crate::benchmark::report::number::readable;
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use crate::charts::{Curve, Lines, MAX_CURVES, Panel, Scale, Shade};
+use crate::charts::{Curve, Lines, MAX_CURVES, Panel, Scale};
 use std::collections::BTreeSet;
 
 /// Maximum number of points of a curve. More points would hardly be visible, and would enlarge the file.
@@ -12,9 +11,8 @@ const MAX_POINTS: usize = 500;
 /// The moving average spans about 1 / `WINDOWS` of the steps.
 const WINDOWS: usize = 40;
 
-/// Returns the page for these runs, each of which has at least one reward. `fire_cells` is the number of burning cells
-/// per step, and can be empty.
-pub fn rewards(runs: &[PolicyRun], axis_label: &str, fire_cells: &[f32]) -> Lines {
+/// Returns the page for these runs, each of which has at least one reward.
+pub fn rewards(runs: &[PolicyRun], axis_label: &str) -> Lines {
     let groups = groups(runs);
     let n_steps = runs.iter().map(|run| run.rewards.len()).max();
     let window = window(n_steps.unwrap_or(0));
@@ -27,7 +25,6 @@ pub fn rewards(runs: &[PolicyRun], axis_label: &str, fire_cells: &[f32]) -> Line
             title: axis_label.into(),
             scale: Scale::Linear,
             curves,
-            shade: (!fire_cells.is_empty()).then(|| shade(fire_cells, window)),
         }],
     }
 }
@@ -52,22 +49,6 @@ fn note(runs: &[PolicyRun], window: usize, (shown, n_policies): (usize, usize)) 
         note += &format!("; the best {shown} of {n_policies} policies");
     }
     note
-}
-
-fn shade(fire_cells: &[f32], window: usize) -> Shade {
-    let points = moving_average(fire_cells, window);
-    let cells = || {
-        points
-            .iter()
-            .map(|point| point.1)
-            .filter(|cells| cells.is_finite())
-    };
-    let most = cells().fold(0.0, f64::max);
-    let least = cells().fold(most, f64::min);
-    Shade {
-        name: format!("shaded: burning cells of a world, {least:.0} to {most:.0}"),
-        points,
-    }
 }
 
 /// Returns the curves of the best policies, the highest mean first.

@@ -28,7 +28,6 @@ pub fn teams(runs: &[PolicyRun], axis_label: &str) -> Lines {
             title: axis_label.into(),
             scale: Scale::Linear,
             curves: curves.collect(),
-            shade: None,
         }],
     }
 }

@@ -62,7 +62,6 @@ fn panels(rows: &Rows) -> Vec<Panel> {
         title: title.into(),
         scale,
         curves,
-        shade: None,
     };
     panels.map(panel).into()
 }

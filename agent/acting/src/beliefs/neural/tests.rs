@@ -41,25 +41,6 @@ fn filter() -> Box<dyn Filter> {
 }
 
 #[test]
-fn with_a_sensor_an_untrained_network_equals_the_filter() {
-    let model = emberwatch_model::Model::wildfire();
-    let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-    let mut own = NeuralEstimator::new(&network, Some(filter()), shape())
-        .expect("a belief")
-        .with_sensor(model.likelihood().clone())
-        .expect("an inverse");
-    let mut expected = filter();
-    for values in [[255, 2, 255, 0, 1, 255], [1, 2, 255, 2, 255, 255]] {
-        own.correct(&frame(&values)).expect("possible");
-        expected.correct(&frame(&values)).expect("possible");
-        let off = (&own.belief().view() - &expected.belief().view()).mapv(f32::abs);
-        assert!(off.iter().all(|off| *off < 1e-4), "{off}");
-        own.predict();
-        expected.predict();
-    }
-}
-
-#[test]
 fn predictions_together_equal_predictions_alone() {
     let networks = [1, 2].map(|seed| {
         let mut network = NeuralBelief::new(3, seed, &Device::Cpu).expect("a network");
@@ -104,13 +85,13 @@ fn equal_models_have_equal_targets_filters_and_parameters() {
     };
     let learned = || Some(learned_filter());
     let first = model(1, learned(), 1);
-    assert_eq!(first, model(1, learned(), 1));
+    assert!(first == model(1, learned(), 1));
     for other in [
         model(1, learned(), 2),
         model(1, None, 1),
         model(2, learned(), 1),
     ] {
-        assert_ne!(first, other);
+        assert!(first != other);
     }
 }
 

@@ -1,11 +1,10 @@
-//! Tests of the belief that an agent plans on, and of the inputs of its decisions.
+//! Tests of the inputs of an agent's decisions.
 
 use super::*;
 use crate::beliefs::autoencoder::AutoencoderEstimator;
-use crate::beliefs::neural::NeuralModel;
 use crate::beliefs::{KNOWN, numbered_states};
 use crate::policy::LearnedDecisions;
-use crate::testing::{config, learned_filter, network, shape};
+use crate::testing::{config, network, shape};
 use anyhow::Result;
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::Estimator;
@@ -13,7 +12,7 @@ use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Cell, Frame, Grid, Model};
-use emberwatch_network::{Device, Dqn, DqnShape, NeuralBelief};
+use emberwatch_network::{Dqn, DqnShape};
 use std::sync::Arc;
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
@@ -44,86 +43,32 @@ fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent>
     super::agent(&policy, config, &conditions, 6, 7)
 }
 
-/// Returns whether an agent's plans equal the plans on the estimate, and whether they equal the plans on the predictor.
-fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
-    let mut agent = agent(policy, config, learned).expect("an agent");
-    let mut all = [true; 2];
-    for step in 0..4 {
-        let (states, frame) = world(step);
-        agent.correct(&frame, Some(&states)).expect("possible");
-        let estimate = agent.belief().clone();
-        agent.predict();
-        let predictor = agent.belief().clone();
-        let got = agent.plan(&[ROBOT], step);
-        let beliefs = [estimate, predictor];
-        for (all, belief) in all.iter_mut().zip(beliefs) {
-            *all &= got == agent.plan_on(&belief, &[ROBOT], step);
-        }
-    }
-    all
-}
-
-#[test]
-fn every_policy_plans_on_the_configured_belief() {
-    let mut learned = Learned::default();
-    learned.put(learned_filter());
-    learned.put(network(BasisKind::Predictor, |_| true));
-    learned.put(NeuralModel {
-        network: NeuralBelief::new(3, 1, &Device::Cpu).expect("a network"),
-        filter: None,
-        target: 1,
-    });
-    for policy in [
-        "shooting",
-        "known/options/entropy",
-        "oracle_ahead",
-        "learned_beam",
-        "learned+spatial/options/rule",
-        "neural/options/rule",
-        "autoencoder/beam/exploit",
-    ] {
-        let plans = [BasisKind::Estimate, BasisKind::Predictor]
-            .map(|belief| plans(policy, &config(belief), &learned));
-        assert_eq!(plans, [[true, false], [false, true]], "{policy}");
-    }
-}
-
 /// A DQN that chooses options on the belief of a known model.
-fn decisions(basis: BasisKind) -> LearnedDecisions {
-    let settings = config(basis).decisions.settings();
+fn decisions() -> LearnedDecisions {
+    let settings = config().decisions.settings();
     let shape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
     LearnedDecisions {
         beam_width: 30,
         scorer: Arc::new(Dqn::new(settings, shape, 0)),
         belief: &KNOWN,
-        basis,
     }
 }
 
 #[test]
-fn decisions_use_the_belief_that_they_were_learned_with() {
-    for (basis, other, expected) in [
-        (BasisKind::Estimate, BasisKind::Predictor, [true, false]),
-        (BasisKind::Predictor, BasisKind::Estimate, [false, true]),
-    ] {
-        let (other, mut learned) = (config(other), Learned::default());
-        learned.put(network(basis, |_| true));
-        learned.put(decisions(basis));
-        for policy in ["autoencoder/shooting/learned", "known/options/learned"] {
-            assert_eq!(plans(policy, &other, &learned), expected, "{policy}");
-        }
-        let error = agent("known+spatial/options/learned", &other, &learned).err();
-        let error = format!("{:#}", error.expect("decisions on another belief"));
-        let words = "on the belief known+spatial, got decisions on known";
-        assert!(error.contains(words), "{error}");
-    }
+fn decisions_on_another_belief_are_refused() {
+    let mut learned = Learned::default();
+    learned.put(decisions());
+    let error = agent("known+spatial/options/learned", &config(), &learned).err();
+    let error = format!("{:#}", error.expect("decisions on another belief"));
+    let words = "on the belief known+spatial, got decisions on known";
+    assert!(error.contains(words), "{error}");
 }
 
 #[test]
 fn decisions_use_the_beam_width_that_they_were_learned_with() {
-    let mut config = config(BasisKind::Predictor);
+    let mut config = config();
     let mut learned = Learned::default();
-    learned.put(decisions(BasisKind::Predictor));
+    learned.put(decisions());
     for (policy, is_learned) in [
         ("known/options/coverage", false),
         ("known/options/learned", true),
@@ -141,17 +86,15 @@ fn decisions_use_the_beam_width_that_they_were_learned_with() {
 
 #[test]
 fn a_network_decides_from_the_hidden_vector_after_the_frame() {
-    let learned = network(BasisKind::Predictor, |_| true).autoencoder;
+    let learned = network(|_| true).autoencoder;
     let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");
     let before = estimator.hidden().to_vec();
     estimator.correct(&world(0).1).expect("possible");
     let after = estimator.hidden().to_vec();
-    let network = network(BasisKind::Predictor, |dqn| {
-        dqn.best(&before) != dqn.best(&after)
-    });
+    let network = network(|dqn| dqn.best(&before) != dqn.best(&after));
     let best = network.dqn.best(&after);
-    let config = config(BasisKind::Predictor);
-    let expected = network_choices(3)[best].objective(0, &config).target;
+    let config = config();
+    let expected = network_choices(3)[best].objective(0).target;
     let mut learned = Learned::default();
     learned.put(network);
     let mut agent = agent("autoencoder/shooting/learned", &config, &learned).expect("an agent");

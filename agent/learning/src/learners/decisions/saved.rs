@@ -84,7 +84,6 @@ pub(super) fn read(contents: &Contents, device: &Device, learned: &mut Learned) 
     let decisions = LearnedDecisions {
         scorer: Arc::new(dqn),
         belief: saved.kind()?,
-        basis: config.objective.belief,
         beam_width: config.decisions.beam_width,
     };
     ensure!(

@@ -7,7 +7,6 @@ pub use self::neighbours::Neighbours;
 use crate::checkpoint::{Contents, check_counts};
 use crate::gradient::Adam;
 use crate::gradient::{Optimiser, Update};
-use crate::learners::base::lacks_steps;
 use crate::models::{SavedFilter, SavedModel, named_tensors, read_parameters};
 use crate::replay::BlockReplay;
 use crate::reward::{RewardEstimate, met};
@@ -101,23 +100,6 @@ impl FilterFit {
         let target = self.reward.target().unwrap_or(last);
         let correlations = self.neighbours.correlations_of(target);
         LearnedModel::new(parameters.clone(), target, correlations)
-    }
-
-    /// Explains why a run with this number of steps made no update, and what to do.
-    pub fn lacks(&self, steps: u64) -> String {
-        let config = self.optimiser.config();
-        let (expected, got) = (config.streams, self.replay.n_blocks());
-        if got < expected {
-            return format!(
-                "an update needs {expected} blocks of frames (learning.streams), and there were {got}; a block ends \
-                 after {} frames or with its episode: train for more --steps",
-                config.window * config.block_windows
-            );
-        }
-        if steps as f64 * config.updates_per_step < 1.0 {
-            return lacks_steps("learning.updates_per_step", config.updates_per_step);
-        }
-        "the frames show no cell".into()
     }
 
     pub fn n_updates(&self) -> u64 {

@@ -7,18 +7,15 @@ use emberwatch_acting::beliefs::WorldForm;
 use emberwatch_acting::beliefs::autoencoder::AutoencoderModel;
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::policy::network_choices;
-use emberwatch_belief::planning::BasisKind;
 use emberwatch_model::{MAX_VALUES, Shape};
 use emberwatch_network::{Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// The learned networks and estimates. Estimators contain copies of the autoencoder.
-#[derive(Debug)]
 pub struct Progress {
     pub autoencoder: Autoencoder,
     pub dqn: Dqn,
-    /// The belief that paths are planned on while the DQN learns.
-    pub basis: BasisKind,
     pub reward: RewardEstimate,
     pub iterations: u64,
 }
@@ -51,7 +48,6 @@ impl Progress {
         Ok(Self {
             autoencoder: Autoencoder::new(settings, shape, config.seed, device)?,
             dqn: Dqn::new(config.dqn.settings(), actions, config.seed),
-            basis: config.objective.belief,
             reward: RewardEstimate::new(n_states),
             iterations: 0,
         })
@@ -91,7 +87,10 @@ impl Progress {
         let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
         let fits = fits.contains(&form.n_observations);
         check(fits, "n_observations", expected, form.n_observations)?;
-        check_size(contents, &network_shape(&form, &config))?;
+        // A small file must not exhaust memory.
+        for (name, shape) in network_shape(&form, &config).grid_tensors() {
+            contents.tensor(name, &shape)?;
+        }
         let mut progress = Self::first(&form, &config, device)?;
         progress.load(contents)?;
         Ok(progress)
@@ -102,8 +101,7 @@ impl Progress {
         AutoencoderModel {
             target: self.target(),
             autoencoder: self.autoencoder,
-            dqn: self.dqn,
-            basis: self.basis,
+            dqn: Arc::new(self.dqn),
         }
     }
 
@@ -138,17 +136,4 @@ fn network_shape(form: &WorldForm, config: &AgentConfig) -> NetworkShape {
         encoding: settings.encoding,
         hidden: settings.hidden,
     }
-}
-
-/// Checks that the file contains enough values for the sizes that it declares. Without this check, a small file could
-/// exhaust memory.
-fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<()> {
-    let expected = shape.n_numbers();
-    let tensors = contents.tensors.values();
-    let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();
-    let words = format!(
-        "at least {expected} numbers for a network on a {} grid",
-        shape.grid
-    );
-    check(got >= expected, "tensors", words, got)
 }

@@ -1,6 +1,6 @@
 //! Behaviours of robots while a belief is learned. A behaviour assigns values to cells, and lasts for several steps.
 
-use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::{CellValues, Objective};
 use emberwatch_model::{Airspace, Grid, Shape};
 use emberwatch_network::Sightings;
@@ -97,7 +97,7 @@ impl Behaviour {
                 let mut values = objective.values_in(belief, airspace);
                 if entropy > 0 {
                     let weight = f32::from(entropy) / 10.0;
-                    values.add_in_sight(weight, &belief.entropy(EntropyKind::Sum));
+                    values.add_in_sight(weight, &belief.entropy());
                 }
                 Some(values)
             }
@@ -129,18 +129,6 @@ impl Behaviour {
         };
         let values = (0..shape.n_cells()).map(value).collect();
         Grid::from_shape_vec(shape.dim(), values).expect("invariant: one value per cell")
-    }
-
-    /// Returns a short description for observers.
-    pub fn label(&self) -> &'static str {
-        match self.aim {
-            Aim::Walk => "random moves",
-            Aim::Cover => "coverage",
-            Aim::Far => "a distant cell",
-            Aim::Last => "sightings of the highest reward",
-            Aim::Exploit { entropy: 0 } => "the highest reward",
-            Aim::Exploit { .. } => "the highest reward, and entropy",
-        }
     }
 }
 

@@ -97,8 +97,7 @@ def load(
 
     A learned belief has its own order of states: `Belief.state_names` are ``"state 0"`` and so on,
     and `Belief.target_state` is the number of the state that pays most. A neural belief predicts
-    observed values instead of states, so S = O. ``"neural+sensor"`` infers the states from these
-    values with the observation matrix of `model`.
+    observed values instead of states, so S = O.
 
     Args:
         checkpoint: Path of the file. Filters and neural beliefs fit any grid, an autoencoder only
@@ -107,8 +106,8 @@ def load(
         width: Columns of the grid.
         kind: A learned kind of `kinds`, such as ``"learned+spatial"``. None: the kind that the
             checkpoint was trained for.
-        model: The model of the worlds, required by ``"neural+sensor"``. If given, the checkpoint
-            must have the same number of observed values.
+        model: The model of the worlds. If given, the checkpoint must have the same number of
+            observed values.
         n_worlds: Number of worlds, at least 1. None: a single world, and arrays without an axis
             for worlds.
 
