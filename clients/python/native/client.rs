@@ -2,7 +2,7 @@
 
 use crate::answer::StepAnswer;
 use crate::arguments::{Number, absolute_path, count, duration, range_of};
-use crate::errors::{raise, raise_of_channel};
+use crate::errors::{plain, raise, raise_of_channel};
 use crate::lease::Lease;
 use crate::model::shape_of;
 use crate::owned::Owned;
@@ -74,7 +74,7 @@ pub fn connect(py: Python<'_>, instance: &str, timeout: f64, wait: f64) -> PyRes
         let mut has_warned = false;
         Connection::open_within(&name, NAME, limits, |error| {
             if !has_warned {
-                let text = format!("{error}; waiting up to {wait} s for a server");
+                let text = format!("{}; waiting up to {wait} s for a server", plain(error));
                 warned = Python::attach(|py| warn_in_log(py, &text));
             }
             has_warned = true;

@@ -131,6 +131,6 @@ pub fn bad_answer(py: Python<'_>, problem: &str) -> PyErr {
 }
 
 /// Returns the message of an error, with names in the quotes that Python's messages use.
-fn plain(problem: &impl Display) -> String {
+pub fn plain(problem: &impl Display) -> String {
     problem.to_string().replace('"', "'")
 }

@@ -146,7 +146,7 @@ def test_priors_are_given_by_name_or_array() -> None:
     for prior, expected in (("flat", "got 'flat'"), (given[:, :, 1:], "got .3, 4, 5.")):
         with pytest.raises(ValueError, match=f"prior: expected .*{expected}"):
             BeliefObservation(Stub(), prior=prior)
-    with pytest.raises(ValueError, match=r"prior: cell \(0, 0\)"):
+    with pytest.raises(ValueError, match=r"prior: belief of cell \(0, 0\)"):
         BeliefObservation(Stub(), prior=given * 2)
 
 

@@ -70,7 +70,7 @@ def flown() -> list[tuple[NDArray[np.void], NDArray[np.uint8], NDArray[np.uint8]
 
 def states(client: Any) -> NDArray[np.uint8]:
     truths = client.truths(range(N_WORLDS))
-    return np.stack([np.asarray(truth["states"]) for truth in truths])
+    return np.stack([truth.states for truth in truths])
 
 
 def made(kind: str, checkpoint: Path | None, n_worlds: int | None = None) -> Belief:
@@ -92,11 +92,11 @@ def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArra
     )
     path = None if checkpoint is None else str(checkpoint)
     read = None if path is None else (path, _native.checkpoint_bytes(path))
-    options = _native.Options(spec, N_WORLDS, kind, read, "simulated", None)
-    worlds = list(range(N_WORLDS))
-    options.start_episodes(worlds, [1000, 1001, 1002])
+    options = _native.Options(spec, N_WORLDS, kind, read, "simulated")
+    worlds, all_of_them = range(N_WORLDS), np.ones(N_WORLDS, bool)
+    options.start_episodes(all_of_them, flown[0][0].view(np.uint8).ravel())
     for results, frames, _ in flown:
-        options.see(worlds, results.view(np.uint8).ravel(), frames)
+        options.update(all_of_them, results.view(np.uint8).ravel(), frames)
         left = [options.left(world) for world in worlds]
         numbers = [np.frombuffer(data[: 4 * 3 * 256], np.float32) for _, data in left]
         yield np.stack([it.reshape(3, 16, 16) for it in numbers], axis=1)

@@ -17,7 +17,6 @@ from emberwatch.client import recording
 from emberwatch.client.observer import Frame, RobotFrame, Truth
 from emberwatch.client.recording import Record
 from emberwatch.client.replies import RecordedWorld, ServerInfo
-from emberwatch.client.replies import record as parsed
 from emberwatch.client.wire import RobotResult, WorldResult
 from emberwatch.model import Model
 from emberwatch.model.airspace import Airspace
@@ -31,8 +30,8 @@ HEIGHT, WIDTH, SCALE = 3, 5, 10
 LEFTS, TOP = [14, 180, 346, 512], 76
 INFO = document.examples()[1] | {"height": HEIGHT, "width": WIDTH, "n_moves": 2, "n_robots": 1}
 INFO |= {"recorded_world": None, "burn_in": 9, "model": MODEL.toml}
-INFO |= {"n_observations": 3, "observations": list(MODEL.observation_names)}
-SERVER: ServerInfo = parsed(ServerInfo, INFO)
+INFO |= {"n_observations": 3, "observations": MODEL.observation_names, "airspace": Airspace()}
+SERVER = ServerInfo(**{name: it for name, it in INFO.items() if name != "reply"})
 SEEN = np.full((HEIGHT, WIDTH), 255, np.uint8)
 SEEN[0, :2], SEEN[1, 1] = [0, 1], 2
 TRUTH = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH) % 3

@@ -45,7 +45,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"values": np.full((1, 2, 2), np.nan)}, "values: expected finite numbers"),
     ({"robots": np.zeros((1, 2))}, "robots: expected integers .*, got float64"),
     ({"robots": np.zeros((2, 2), int)}, r"robots: expected .* of shape \(1, 2\)"),
-    ({"robots": np.array([(0, 2)])}, r"robots: expected cells of a 2 x 2 grid, .* got \[0, 2\]"),
+    ({"robots": np.array([(0, 2)])}, r"robots: expected cells of a 2 x 2 grid .* got \[0, 2\]"),
     ({"visited": np.zeros(4)}, r"visited: expected shape \(1, 2, 2\), got \(4,\)"),
     ({"airspace": Airspace(no_fly=np.zeros((5, 7), bool))}, r"no_fly: expected shape \(2, 2\)"),
     (
