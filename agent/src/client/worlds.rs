@@ -21,7 +21,7 @@ pub enum Worlds {
         instance: Instance,
         connection: Box<Connection>,
         /// `None` if hidden states are not needed or not published.
-        truth: Option<TruthFeed>,
+        truth: Option<Box<TruthFeed>>,
     },
     Simulated(Box<Embedded>),
 }
@@ -36,7 +36,7 @@ impl Worlds {
         let info = connection.info();
         let truth = (reads_truth && info.publish_truth).then(|| {
             let shape = info.shape().map_err(anyhow::Error::msg)?;
-            TruthFeed::open(instance, shape)
+            TruthFeed::open(instance, shape).map(Box::new)
         });
         Ok(Self::Attached {
             instance: instance.clone(),
@@ -72,7 +72,7 @@ impl Worlds {
     pub fn states(&mut self, seeds: &[u64], step: u64) -> Result<Option<Vec<Grid<u8>>>> {
         match self {
             Self::Attached { truth, .. } => {
-                let states = |truth: &TruthFeed| truth.states(0..seeds.len() as u32, seeds, step);
+                let states = |truth: &Box<TruthFeed>| truth.states(0..seeds.len() as u32, seeds, step);
                 truth.as_ref().map(states).transpose()
             }
             Self::Simulated(worlds) => {

@@ -127,7 +127,7 @@ reader! {
             world: Option<Number>,
             timeout: Option<f64>,
         ) -> PyResult<Self> {
-            if let Some(got) = timeout.filter(|it| !(*it >= 0.0)) {
+            if let Some(got) = timeout.filter(|it| it.is_nan() || *it < 0.0) {
                 let expected = "seconds of at least 0, or None";
                 return Err(invalid(py, "timeout", expected, got));
             }
