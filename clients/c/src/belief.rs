@@ -10,16 +10,12 @@ use emberwatch_messages::left_belief::{self, LeftBelief};
 use emberwatch_messages::message::{AgentHeader, Status, worlds_of};
 use emberwatch_model::grid::Probabilities;
 use emberwatch_protocol::agent_belief::BeliefPublisher;
-use std::collections::HashMap;
 use std::ffi::c_char;
 use std::sync::PoisonError;
-use std::time::{Duration, Instant};
-
-/// Minimum time between two beliefs about the same robot: displays need no higher rate, and each costs a copy.
-const INTERVAL: Duration = Duration::from_millis(20);
 
 /// What a display shows about the agent behind a belief. Pointers may be NULL.
 #[repr(C)]
+#[derive(Default)]
 pub struct Intent {
     /// Name of the policy.
     pub policy: *const c_char,
@@ -52,54 +48,33 @@ pub struct Left {
 
 pub type LeftView = View<Left, (Texts, LeftBelief)>;
 
-/// The beliefs that the leases of one server publish.
-pub struct Publisher {
-    channel: BeliefPublisher,
-    /// When a belief about each first robot was last published.
-    shown: HashMap<u32, Instant>,
-}
-
-impl Publisher {
-    fn is_due(&self, robot: u32) -> bool {
-        let shown = self.shown.get(&robot);
-        self.channel.is_watched() && shown.is_none_or(|shown| shown.elapsed() >= INTERVAL)
-    }
-}
-
-impl Drop for Publisher {
-    /// Gives readers time to receive the last belief.
-    fn drop(&mut self) {
-        if !self.shown.is_empty() && self.channel.is_watched() {
-            std::thread::sleep(INTERVAL);
-        }
-    }
-}
-
 /// Converts what C says about a belief of `n_states` states.
-fn intent_of(core: &Core, n_states: usize, given: Option<&Intent>) -> Outcome<WireIntent> {
-    let words = |of: fn(&Intent) -> *const c_char| match given.map(of) {
-        Some(given) if !given.is_null() => text("intent", given).map(String::from),
-        _ => Ok(String::new()),
+fn intent_of(core: &Core, n_states: usize, given: &Intent) -> Outcome<WireIntent> {
+    let words = |given: *const c_char| match given.is_null() {
+        true => Ok(String::new()),
+        false => text("intent", given).map(String::from),
     };
-    let states = match given.map(|it| it.states).filter(|it| !it.is_null()) {
-        Some(names) => array("states", names, n_states)?
+    let states = if given.states.is_null() {
+        core.state_names(n_states)
+    } else {
+        let names = array("states", given.states, n_states)?;
+        names
             .iter()
-            .map(|&name| text("states", name).map(String::from))
-            .collect::<Outcome<Vec<_>>>()?,
-        None => core.state_names(n_states),
+            .map(|&name| words(name))
+            .collect::<Outcome<_>>()?
     };
     Ok(WireIntent {
-        policy: words(|it| it.policy)?,
-        belief_from: words(|it| it.belief_from)?,
-        objective: words(|it| it.objective)?,
+        policy: words(given.policy)?,
+        belief_from: words(given.belief_from)?,
+        objective: words(given.objective)?,
         states,
-        plan_millis: given.map_or(0.0, |it| it.plan_millis),
+        plan_millis: given.plan_millis,
     })
 }
 
 /// Publishes a belief about a world after its last answer, for dashboards: n_states * H * W probabilities, state by
-/// state. The robots of the world from `first_robot` on fly by it. The call does nothing without readers, within 20 ms
-/// of the last belief about `first_robot`, and for worlds in this process. `intent` may be NULL.
+/// state. The robots of the world from `first_robot` on fly by it. The call does nothing without readers, and for
+/// worlds in this process. `intent` may be NULL.
 #[unsafe(no_mangle)]
 pub extern "C" fn ew_publish_belief(
     lease: *mut LeaseHandle,
@@ -127,22 +102,22 @@ pub extern "C" fn ew_publish_belief(
         let Some(instance) = &core.instance else {
             return Ok(());
         };
-        let mut publisher = core
-            .publisher
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        if publisher.is_none() {
-            let n_bytes = size_of_val(numbers) + 1024; // The intent is a few hundred bytes of text.
-            *publisher = Some(Publisher {
-                channel: BeliefPublisher::open(instance, n_bytes)?,
-                shown: HashMap::new(),
-            });
-        }
-        let Some(publisher) = publisher.as_mut().filter(|it| it.is_due(first_robot)) else {
-            return Ok(());
+        let publisher = core.publisher.lock();
+        let mut publisher = publisher.unwrap_or_else(PoisonError::into_inner);
+        let publisher = match &mut *publisher {
+            Some(publisher) => publisher,
+            // The intent is a few hundred bytes of text.
+            none => {
+                let n_bytes = size_of_val(numbers) + 1024;
+                none.insert(BeliefPublisher::open(instance, n_bytes)?)
+            }
         };
+        if !publisher.is_watched() {
+            return Ok(());
+        }
         // SAFETY: the caller passes null or a pointer to an `ew_intent`.
-        let intent = intent_of(core, dim.0, unsafe { intent.as_ref() })?;
+        let intent = unsafe { intent.as_ref() };
+        let intent = intent_of(core, dim.0, intent.unwrap_or(&Intent::default()))?;
         let about = AgentHeader {
             world,
             episode: result.episode,
@@ -154,8 +129,7 @@ pub extern "C" fn ew_publish_belief(
         };
         let belief = Probabilities::from_shape_vec(dim, numbers.to_vec());
         let belief = belief.expect("invariant: as many numbers as cells");
-        publisher.channel.show(about, &belief, &intent)?;
-        publisher.shown.insert(first_robot, Instant::now());
+        publisher.show(about, &belief, &intent)?;
         Ok(())
     })
 }
@@ -203,16 +177,15 @@ pub extern "C" fn ew_left_belief(
             return Err(Error::new(Status::NotKept as i32, "no belief was left"));
         };
         let mut texts = Texts::default();
-        let kind = texts.add(&left.info.kind);
-        let view = View::new((texts, left), |(_, left)| Left {
-            kind,
+        let view = Left {
+            kind: texts.add(&left.info.kind),
             bytes: left.bytes.as_ptr(),
             n_bytes: left.bytes.len(),
             seed: left.info.seed,
             episode: left.info.episode,
             step: left.info.step,
-        });
-        keep(&mut server.kept().left, view, out);
+        };
+        keep(&mut server.kept().left, View::new(view, (texts, left)), out);
         Ok(())
     })
 }

@@ -1,8 +1,6 @@
 //! Return codes and messages. No panic leaves this library.
 
 use emberwatch_messages::errors::{ChannelError, ConnectionError, ErrorClass};
-use emberwatch_messages::message::Status;
-use emberwatch_sim::embedded::settings::ReadError;
 use std::ffi::c_char;
 use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -24,8 +22,6 @@ pub const EW_MESSAGE_BYTES: usize = 496;
 pub struct ErrorInfo {
     /// The returned code.
     pub code: i32,
-    /// Always 0.
-    pub reserved: u32,
     /// The detail of an ew_status; the server's version for EW_FAILURE_OTHER_VERSION; otherwise 0.
     pub detail: u64,
     /// A sentence in UTF-8, ended by 0 and cut if it is too long.
@@ -63,48 +59,25 @@ pub fn invalid(what: &str, expected: impl Display, got: impl Display) -> Error {
 
 impl From<ConnectionError> for Error {
     fn from(error: ConnectionError) -> Self {
-        let other = Self::of_class(error.class(), &error);
-        let (code, detail, message) = match error {
-            ConnectionError::Refused {
-                status: status @ Status::Busy,
-                detail,
-                ..
-            } => {
-                let text =
-                    format!("busy: held by pid {detail}; wait for its release, or take over");
-                (status as i32, detail, text)
-            }
+        let mut new = Self::of_class(error.class(), &error);
+        match error {
             ConnectionError::Refused {
                 status,
                 detail,
                 message,
-            } => (status as i32, detail, message),
+            } => (new.code, new.detail, new.message) = (status as i32, detail, message),
             ConnectionError::Channel(ChannelError::OtherVersion { version }) => {
-                (other.code, version.into(), other.message)
+                new.detail = version.into();
             }
-            _ => return other,
-        };
-        Self {
-            code,
-            detail,
-            message,
+            _ => {}
         }
+        new
     }
 }
 
 impl From<ChannelError> for Error {
     fn from(error: ChannelError) -> Self {
         ConnectionError::from(error).into()
-    }
-}
-
-impl From<ReadError> for Error {
-    fn from(error: ReadError) -> Self {
-        match error {
-            ReadError::Config(error) => Self::of_class(ErrorClass::Invalid, error),
-            ReadError::Threads(error) => Self::of_class(ErrorClass::Memory, error),
-            ReadError::Wait(error) => error.into(),
-        }
     }
 }
 
@@ -125,10 +98,13 @@ pub fn guard(to: *mut ErrorInfo, call: impl FnOnce() -> Outcome) -> i32 {
 }
 
 fn write(error: &Error, to: &mut ErrorInfo) {
-    let end = error.message.floor_char_boundary(EW_MESSAGE_BYTES - 1);
+    let mut end = error.message.len().min(EW_MESSAGE_BYTES - 1);
+    while !error.message.is_char_boundary(end) {
+        end -= 1;
+    }
     to.message = [0; EW_MESSAGE_BYTES];
     for (to, byte) in to.message.iter_mut().zip(&error.message.as_bytes()[..end]) {
         *to = *byte as c_char;
     }
-    (to.code, to.reserved, to.detail) = (error.code, 0, error.detail);
+    (to.code, to.detail) = (error.code, error.detail);
 }

@@ -1,6 +1,7 @@
 //! Handles, and what C passes besides them: texts, arrays, timeouts.
 
 use crate::error::{EW_FAILURE_FORKED, EW_FAILURE_IN_USE, Error, Outcome, guard, invalid};
+use std::any::{TypeId, type_name};
 use std::ffi::{CStr, c_char, c_void};
 use std::mem::forget;
 use std::ptr::null_mut;
@@ -17,23 +18,16 @@ struct Tagged<T> {
 #[repr(C)]
 #[derive(Clone, Copy)]
 struct Tag {
-    kind: u32,
+    kind: TypeId,
     /// The process that made the handle.
     pid: u32,
     free: fn(*mut c_void, bool),
 }
 
-/// A type of handle.
-pub trait Handle: Send + Sized {
-    /// A number that no other type has.
-    const KIND: u32;
-    const NAME: &'static str;
-}
-
 /// Gives a handle to C, which sees an opaque pointer.
-pub fn give<T: Handle>(value: T, to: *mut *mut T) -> Outcome {
+pub fn give<T: Send + 'static>(value: T, to: *mut *mut T) -> Outcome {
     let tag = Tag {
-        kind: T::KIND,
+        kind: TypeId::of::<T>(),
         pid: std::process::id(),
         free: free::<T>,
     };
@@ -45,13 +39,14 @@ pub fn give<T: Handle>(value: T, to: *mut *mut T) -> Outcome {
 }
 
 /// Returns what C's handle points to.
-pub fn of<'a, T: Handle>(handle: *mut T) -> Outcome<&'a T> {
+pub fn of<'a, T: 'static>(handle: *mut T) -> Outcome<&'a T> {
+    let expected = type_name::<T>();
     // SAFETY: the caller passes null or a handle that it has not freed, and a handle begins with its tag.
     let Some(tag) = (unsafe { handle.cast::<Tag>().as_ref() }) else {
-        return Err(invalid(T::NAME, "a handle", "NULL"));
+        return Err(invalid("handle", expected, "NULL"));
     };
-    if tag.kind != T::KIND {
-        return Err(invalid(T::NAME, "a handle of this kind", "another handle"));
+    if tag.kind != TypeId::of::<T>() {
+        return Err(invalid("handle", expected, "a handle of another kind"));
     }
     if tag.pid != std::process::id() {
         let text = "this handle belongs to the process that forked this one: make a new one here";
@@ -62,12 +57,12 @@ pub fn of<'a, T: Handle>(handle: *mut T) -> Outcome<&'a T> {
 }
 
 /// Takes the part of a handle that only one thread may use at a time.
-pub fn hold<'a, T>(part: &'a Mutex<T>, name: &str) -> Outcome<MutexGuard<'a, T>> {
+pub fn hold<T>(part: &Mutex<T>) -> Outcome<MutexGuard<'_, T>> {
     match part.try_lock() {
         Ok(held) => Ok(held),
         Err(TryLockError::Poisoned(held)) => Ok(held.into_inner()),
         Err(TryLockError::WouldBlock) => {
-            let text = format!("another thread is using this {name}");
+            let text = "another thread is using this handle";
             Err(Error::new(EW_FAILURE_IN_USE, text))
         }
     }

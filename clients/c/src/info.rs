@@ -1,23 +1,9 @@
 //! The settings of a server as C structs.
 
-use crate::view::{Texts, View, or_null};
-use emberwatch_messages::control::{CoverageRule, ServerInfo};
+use crate::view::{Texts, View};
+use emberwatch_messages::control::ServerInfo;
 use std::ffi::c_char;
 use std::ptr::null;
-
-/// The values of a move in a path.
-#[repr(C)]
-#[allow(dead_code, reason = "for C only")]
-pub enum MoveCode {
-    /// Row - 1.
-    Up = 0,
-    /// Row + 1.
-    Down = 1,
-    /// Column - 1.
-    Left = 2,
-    /// Column + 1.
-    Right = 3,
-}
 
 /// The settings of a server.
 #[repr(C)]
@@ -54,12 +40,8 @@ pub struct Info {
     pub task: *const c_char,
     /// Identifies the worlds, 16 hexadecimal digits; NULL from old servers.
     pub worlds_fingerprint: *const c_char,
-    /// Steps simulated before k = 0.
-    pub burn_in: u64,
     /// Length of an episode; 0: never truncated.
     pub max_steps: u64,
-    /// Default life of an unused lease, milliseconds.
-    pub lease_millis: u64,
     /// Time that a world waits for late paths, milliseconds; 0: no deadline.
     pub deadline_millis: u64,
     /// Rows and columns that robots see beyond the cells of their path.
@@ -70,14 +52,14 @@ pub struct Info {
     pub publish_truth: bool,
 }
 
-pub type InfoView = View<Info, (Texts, Vec<f64>, Vec<u8>)>;
+pub type InfoView = View<Info, (Texts, Option<Vec<f64>>, Option<Vec<u8>>)>;
 
 pub fn view_of(info: &ServerInfo) -> InfoView {
     let airspace = info.airspace.as_ref();
     let no_fly = airspace.and_then(|it| it.no_fly.as_ref());
-    let no_fly = no_fly.map_or(Vec::new(), |rows| rows.concat());
+    let no_fly = no_fly.map(|rows| rows.concat());
     let model = info.revealed_model();
-    let rewards = model.as_ref().map_or(Vec::new(), |it| it.reward().to_vec());
+    let rewards = model.as_ref().map(|it| it.reward().to_vec());
     let mut texts = Texts::default();
     let view = Info {
         pid: info.pid,
@@ -87,25 +69,22 @@ pub fn view_of(info: &ServerInfo) -> InfoView {
         n_worlds: info.n_worlds,
         n_robots: info.n_robots,
         n_observations: info.n_observations as u32,
-        n_states: rewards.len() as u32,
+        n_states: rewards.as_ref().map_or(0, |it| it.len() as u32),
         observations: texts.add_all(&info.observations),
         states: model.map_or(null(), |it| texts.add_all(&it.state_names())),
-        rewards: or_null(&rewards),
-        no_fly: or_null(&no_fly),
-        model: texts.add_option(info.model.as_deref()),
+        rewards: rewards.as_ref().map_or(null(), |it| it.as_ptr()),
+        no_fly: no_fly.as_ref().map_or(null(), |it| it.as_ptr()),
+        model: info.model.as_ref().map_or(null(), |it| texts.add(it)),
         build: texts.add(&info.build),
-        task: texts.add_option(info.task.as_deref()),
-        worlds_fingerprint: texts.add_option(info.worlds_fingerprint.as_deref()),
-        burn_in: info.burn_in,
+        task: info.task.as_ref().map_or(null(), |it| texts.add(it)),
+        worlds_fingerprint: info
+            .worlds_fingerprint
+            .as_ref()
+            .map_or(null(), |it| texts.add(it)),
         max_steps: info.max_steps,
-        lease_millis: info.lease_millis,
         deadline_millis: info.deadline_millis,
         radius: airspace.map_or(0, |it| it.radius as u32),
-        coverage: match info.coverage {
-            CoverageRule::Path => 0,
-            CoverageRule::Full => 1,
-            CoverageRule::Client => 2,
-        },
+        coverage: info.coverage as u32,
         publish_truth: info.publish_truth,
     };
     View::new(view, (texts, rewards, no_fly))

@@ -1,10 +1,10 @@
 //! Leases: the right to fly consecutive robots.
 
 use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
-use crate::handle::{Handle, array, duration, give, hold, of};
+use crate::handle::{array, duration, give, hold, of};
 use crate::server::{Core, Server};
 use crate::view::{View, keep};
-use emberwatch_messages::backend::{Backend, StepAnswer};
+use emberwatch_messages::backend::StepAnswer;
 use emberwatch_messages::client::STEP_TIMEOUT;
 use emberwatch_messages::control::WorldSeed;
 use emberwatch_messages::errors::{ConnectionError, ErrorClass, garbled};
@@ -14,7 +14,7 @@ use emberwatch_messages::message::{
 };
 use emberwatch_messages::payload::split_step_payload;
 use std::ops::Range;
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Frames show every cell, if the server's coverage allows it.
@@ -33,12 +33,8 @@ pub struct LeaseHandle {
     pub core: Arc<Core>,
     pub robots: Range<u32>,
     lease: Lease,
-    held: Mutex<Held>,
-}
-
-impl Handle for LeaseHandle {
-    const KIND: u32 = 0x4557_0002;
-    const NAME: &'static str = "lease";
+    /// The last answer, to which C has a pointer.
+    last: Mutex<Option<AnswerView>>,
 }
 
 /// The results of worlds and robots, and the frames.
@@ -77,19 +73,7 @@ type Seen = (StepAnswer, u64);
 
 type AnswerView = View<Answer, (Vec<WorldResult>, Vec<RobotResult>, Vec<u8>)>;
 
-/// What only one thread may use at a time.
-#[derive(Default)]
-struct Held {
-    answer: Option<AnswerView>,
-    is_released: bool,
-}
-
 impl LeaseHandle {
-    /// Takes the lease for a call of this thread.
-    fn hold(&self) -> Outcome<MutexGuard<'_, Held>> {
-        hold(&self.held, Self::NAME)
-    }
-
     pub fn number(&self) -> u64 {
         self.lease.number()
     }
@@ -102,15 +86,10 @@ impl LeaseHandle {
         }
         let world = worlds_of(robot, 1, self.core.info.n_robots).start;
         let index = (world - self.lease.worlds().start) as usize;
-        let held = self.hold()?;
-        let known = held.answer.as_ref();
-        match known.and_then(|answer| answer.owned.0.get(index)) {
-            Some(result) => Ok((world, *result)),
-            None => {
-                let expected = "ew_reset, ew_step or ew_observe before it";
-                Err(invalid("belief", expected, "no step"))
-            }
-        }
+        let last = hold(&self.last)?;
+        let result = last.as_ref().and_then(|answer| answer.owned.0.get(index));
+        let missing = || invalid("belief", "ew_reset, ew_step or ew_observe before", "none");
+        Ok((world, *result.ok_or_else(missing)?))
     }
 
     /// Makes the view of an answer, and of the number of steps before it that were missed.
@@ -143,14 +122,11 @@ impl LeaseHandle {
         self.core.with(|backend| self.lease.send(backend, call))
     }
 
-    fn look(&self, flags: u32, limit: Duration) -> Outcome<Seen> {
-        let request = self.lease.request(Operation::Observe, &self.robots, flags);
-        Ok((self.send(&mut Call::new(request, &[], limit))?, 0))
-    }
-
-    fn look_back(&self, step: u64, flags: u32, limit: Duration) -> Outcome<Seen> {
-        let request = self.lease.request(Operation::Recall, &self.robots, flags);
-        let steps = vec![step; self.lease.worlds().len()];
+    /// Asks for the results and frames of an earlier step, or for the last ones.
+    fn look(&self, step: Option<u64>, flags: u32, limit: Duration) -> Outcome<Seen> {
+        let operation = step.map_or(Operation::Observe, |_| Operation::Recall);
+        let request = self.lease.request(operation, &self.robots, flags);
+        let steps = step.map_or(Vec::new(), |step| vec![step; self.lease.worlds().len()]);
         Ok((self.send(&mut Call::of_past(request, steps, limit))?, 0))
     }
 
@@ -169,9 +145,13 @@ impl LeaseHandle {
         }
         let worlds = worlds.zip(given);
         let worlds = worlds.map(|(world, seed)| WorldSeed { world, seed });
-        let reset = |backend: &mut dyn Backend| self.lease.reset(backend, worlds.collect(), limit);
-        self.core.with(reset)?;
-        self.look(0, limit.saturating_sub(start.elapsed()).max(STEP_TIMEOUT))
+        self.core
+            .with(|backend| self.lease.reset(backend, worlds.collect(), limit))?;
+        self.look(
+            None,
+            0,
+            limit.saturating_sub(start.elapsed()).max(STEP_TIMEOUT),
+        )
     }
 
     fn fly(&self, moves: *const u8, n: usize, flags: u32, limit: Duration) -> Outcome<Seen> {
@@ -183,12 +163,9 @@ impl LeaseHandle {
             return Err(invalid("paths", expected, n));
         }
         let moves = array("paths", moves, n)?;
-        let wire_flags = flags & !EW_ACCEPT_LATE;
-        let request = self
-            .lease
-            .request(Operation::Step, &self.robots, wire_flags);
+        let (accepts_late, flags) = (flags & EW_ACCEPT_LATE != 0, flags & !EW_ACCEPT_LATE);
+        let request = self.lease.request(Operation::Step, &self.robots, flags);
         let paths = Call::new(request, moves, limit.min(STEP_TIMEOUT));
-        let accepts_late = flags & EW_ACCEPT_LATE != 0;
         let send = |call: &mut Call<'_>| self.send(call);
         let is_over = || Ok(start.elapsed() >= limit);
         let flown = self.lease.send_paths(paths, accepts_late, send, is_over)?;
@@ -202,10 +179,8 @@ impl LeaseHandle {
 impl Drop for LeaseHandle {
     /// Releases the robots, so that another client need not wait until the lease expires.
     fn drop(&mut self) {
-        if !self.held.get_mut().is_ok_and(|held| held.is_released) {
-            let limit = Duration::from_secs(1);
-            let _ = self.core.with(|worlds| self.lease.release(worlds, limit));
-        }
+        let limit = Duration::from_secs(1);
+        let _ = self.core.with(|worlds| self.lease.release(worlds, limit));
     }
 }
 
@@ -218,8 +193,8 @@ fn answer(
 ) -> i32 {
     guard(error, || {
         let lease = of(lease)?;
-        let mut held = lease.hold()?;
-        keep(&mut held.answer, lease.view(ask(lease)?)?, out);
+        let mut last = hold(&lease.last)?;
+        keep(&mut last, lease.view(ask(lease)?)?, out);
         Ok(())
     })
 }
@@ -251,7 +226,7 @@ pub extern "C" fn ew_acquire(
             core,
             robots,
             lease,
-            held: Mutex::default(),
+            last: Mutex::default(),
         };
         give(lease, out)
     })
@@ -303,7 +278,7 @@ pub extern "C" fn ew_observe(
     error: *mut ErrorInfo,
 ) -> i32 {
     answer(lease, out, error, |lease| {
-        lease.look(flags, duration(timeout))
+        lease.look(None, flags, duration(timeout))
     })
 }
 
@@ -319,7 +294,7 @@ pub extern "C" fn ew_recall(
     error: *mut ErrorInfo,
 ) -> i32 {
     answer(lease, out, error, |lease| {
-        lease.look_back(step, flags, duration(timeout))
+        lease.look(Some(step), flags, duration(timeout))
     })
 }
 
@@ -328,8 +303,9 @@ pub extern "C" fn ew_recall(
 pub extern "C" fn ew_renew(lease: *mut LeaseHandle, timeout: f64, error: *mut ErrorInfo) -> i32 {
     guard(error, || {
         let lease = of(lease)?;
-        let renew = |backend: &mut dyn Backend| lease.lease.renew(backend, duration(timeout));
-        Ok(lease.core.with(renew)?)
+        Ok(lease
+            .core
+            .with(|worlds| lease.lease.renew(worlds, duration(timeout)))?)
     })
 }
 
@@ -338,8 +314,8 @@ pub extern "C" fn ew_renew(lease: *mut LeaseHandle, timeout: f64, error: *mut Er
 pub extern "C" fn ew_release(lease: *mut LeaseHandle, timeout: f64, error: *mut ErrorInfo) -> i32 {
     guard(error, || {
         let lease = of(lease)?;
-        lease.hold()?.is_released = true;
-        let release = |backend: &mut dyn Backend| lease.lease.release(backend, duration(timeout));
-        Ok(lease.core.with(release)?)
+        Ok(lease
+            .core
+            .with(|worlds| lease.lease.release(worlds, duration(timeout)))?)
     })
 }

@@ -3,7 +3,6 @@
 use crate::error::{ErrorInfo, guard};
 use crate::handle::{duration, of, put};
 use crate::server::Server;
-use emberwatch_messages::backend::Backend;
 use emberwatch_messages::control::{Reply, Request, WorldStatus};
 use emberwatch_messages::errors::unexpected;
 
@@ -48,11 +47,12 @@ pub extern "C" fn ew_status_of(
 ) -> i32 {
     guard(error, || {
         let server = of(server)?;
-        let ask =
-            |backend: &mut dyn Backend| backend.control(&Request::Status {}, duration(timeout));
-        let status = match server.core.with(ask)? {
-            Reply::Status(status) => status,
-            other => return Err(unexpected("status", &other).into()),
+        let request = Request::Status {};
+        let reply = server
+            .core
+            .with(|worlds| worlds.control(&request, duration(timeout)))?;
+        let Reply::Status(status) = reply else {
+            return Err(unexpected("status", &reply).into());
         };
         let mut kept = server.kept();
         kept.reports = status.worlds.iter().map(WorldReport::from).collect();

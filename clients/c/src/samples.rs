@@ -2,8 +2,8 @@
 
 use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
 use crate::fork::watch_forks;
-use crate::handle::{Handle, duration, give, hold, of, text};
-use crate::info::{Info, InfoView, view_of};
+use crate::handle::{duration, give, hold, of, text};
+use crate::info::{Info, view_of};
 use crate::view::{Texts, View, keep};
 use emberwatch_messages::agent_belief::AgentBelief;
 use emberwatch_messages::errors::ErrorClass;
@@ -12,13 +12,11 @@ use emberwatch_messages::message::{AgentHeader, FrameHeader, Published, RobotRes
 use emberwatch_messages::payload::{ROBOT_BYTES, split_frame_payload, truth_states};
 use emberwatch_messages::recording::{Event, Reader, RecordingError};
 use emberwatch_messages::sample::Sample as Received;
-use emberwatch_model::grid::Grid;
 use emberwatch_protocol::observer::Observer;
 use std::ffi::c_char;
 use std::fmt::Display;
 use std::fs::File;
 use std::io::BufReader;
-use std::ptr::null;
 use std::sync::Mutex;
 use std::time::Duration;
 
@@ -76,6 +74,7 @@ pub struct BeliefSample {
 
 /// A sample. One of the pointers is not NULL, except at the end of a recording.
 #[repr(C)]
+#[derive(Default)]
 pub struct Sample {
     /// Nanoseconds since a recording began; 0 from an observer.
     pub nanos: u64,
@@ -96,11 +95,6 @@ pub struct Sample {
 /// An observer or a recording. One thread at a time may use it.
 pub struct Samples(Mutex<Reading>);
 
-impl Handle for Samples {
-    const KIND: u32 = 0x4557_0003;
-    const NAME: &'static str = "samples";
-}
-
 impl Samples {
     fn of(source: Source) -> Self {
         let last = None;
@@ -110,7 +104,7 @@ impl Samples {
 
 struct Reading {
     source: Source,
-    last: Option<View<Sample, Box<Content>>>,
+    last: Option<View<Sample, Memory>>,
 }
 
 enum Source {
@@ -120,13 +114,8 @@ enum Source {
     Recording(Box<Reader<BufReader<File>>>),
 }
 
-enum Content {
-    Server(InfoView),
-    Frame(View<FrameSample, (Vec<RobotResult>, Vec<u8>)>),
-    Truth(View<TruthSample, Grid<u8>>),
-    Belief(View<BeliefSample, (AgentBelief, Texts)>),
-    End,
-}
+/// The memory to which a sample points.
+type Memory = Box<dyn Send>;
 
 fn bad(problem: impl Display) -> Error {
     Error::of_class(ErrorClass::BadAnswer, problem)
@@ -141,7 +130,8 @@ impl From<RecordingError> for Error {
     }
 }
 
-fn frame(Received { header, payload }: Received<FrameHeader>) -> Outcome<Content> {
+fn frame(received: Received<FrameHeader>, to: &mut Sample) -> Outcome<Memory> {
+    let Received { header, payload } = received;
     let parts = split_frame_payload(&header, &payload).map_err(bad)?;
     let robots: Vec<RobotResult> = parts.iter().map(|it| it.result).collect();
     let n_frame_bytes = parts.iter().map(|it| it.frame.len()).sum();
@@ -152,20 +142,24 @@ fn frame(Received { header, payload }: Received<FrameHeader>) -> Outcome<Content
         frames: frames.as_ptr(),
         paths: paths.as_ptr(),
     };
-    Ok(Content::Frame(View::new(view, (robots, payload))))
+    let view = Box::new(View::new(view, (robots, payload)));
+    to.frame = view.pointer();
+    Ok(view)
 }
 
-fn truth(sample: &Received<TruthHeader>) -> Outcome<Content> {
-    let states = truth_states(sample).map_err(bad)?;
+fn truth(received: Received<TruthHeader>, to: &mut Sample) -> Outcome<Memory> {
+    let states = truth_states(&received).map_err(bad)?;
     let view = TruthSample {
-        header: sample.header,
+        header: received.header,
         states: states.as_ptr(),
     };
-    Ok(Content::Truth(View::new(view, states)))
+    let view = Box::new(View::new(view, states));
+    to.truth = view.pointer();
+    Ok(view)
 }
 
-fn belief(sample: &Received<AgentHeader>) -> Outcome<Content> {
-    let found = AgentBelief::try_from(sample).map_err(bad)?;
+fn belief(received: Received<AgentHeader>, to: &mut Sample) -> Outcome<Memory> {
+    let found = AgentBelief::try_from(&received).map_err(bad)?;
     let (intent, mut texts) = (&found.intent, Texts::default());
     let view = BeliefSample {
         header: found.header,
@@ -177,40 +171,47 @@ fn belief(sample: &Received<AgentHeader>) -> Outcome<Content> {
         objective: texts.add(&intent.objective),
         plan_millis: intent.plan_millis,
     };
-    Ok(Content::Belief(View::new(view, (found, texts))))
+    let view = Box::new(View::new(view, (found, texts)));
+    to.belief = view.pointer();
+    Ok(view)
 }
 
-/// Nanoseconds, lost samples, process and content of the next sample.
-type Next = (u64, u64, u32, Content);
-
-/// Waits for the next sample of a channel, and makes its view.
+/// Waits for the next sample of a channel.
 fn observed<H: Published>(
     observer: &Observer<H>,
-    world: Option<u32>,
-    limit: Duration,
-    content: impl FnOnce(Received<H>) -> Outcome<Content>,
-) -> Outcome<Next> {
+    (world, limit): (Option<u32>, Duration),
+    to: &mut Sample,
+    fill: impl FnOnce(Received<H>, &mut Sample) -> Outcome<Memory>,
+) -> Outcome<Memory> {
     let late = || Error::of_class(ErrorClass::Timeout, "no sample in time");
-    let (sample, n_lost) = observer.next_of(world, limit)?.ok_or_else(late)?;
-    let pid = observer.publisher().unwrap_or(0);
-    Ok((0, n_lost, pid, content(sample)?))
+    let (received, n_lost) = observer.next_of(world, limit)?.ok_or_else(late)?;
+    to.n_lost = n_lost;
+    to.pid = observer.publisher().unwrap_or(0);
+    fill(received, to)
 }
 
-/// Reads the next record about a world, about any world, or about a server.
-fn recorded(reader: &mut Reader<BufReader<File>>, world: Option<u32>) -> Outcome<Next> {
-    loop {
-        let Some(record) = reader.next().transpose()? else {
-            return Ok((0, 0, 0, Content::End));
-        };
-        let (of, content) = match record.event {
-            Event::Server(info) => (None, Content::Server(view_of(&info))),
-            Event::Frame(sample) => (Some(sample.header.world), frame(sample)?),
-            Event::Truth(sample) => (Some(sample.header.world), truth(&sample)?),
-        };
-        if of.is_none() || world.is_none() || world == of {
-            return Ok((record.nanos, record.n_lost.into(), 0, content));
+/// Reads the next record about a server or a world.
+fn recorded(
+    reader: &mut Reader<BufReader<File>>,
+    world: Option<u32>,
+    to: &mut Sample,
+) -> Outcome<Memory> {
+    let is_other = |it: u32| world.is_some_and(|world| world != it);
+    while let Some(record) = reader.next().transpose()? {
+        (to.nanos, to.n_lost) = (record.nanos, record.n_lost.into());
+        match record.event {
+            Event::Frame(received) if is_other(received.header.world) => {}
+            Event::Truth(received) if is_other(received.header.world) => {}
+            Event::Frame(received) => return frame(received, to),
+            Event::Truth(received) => return truth(received, to),
+            Event::Server(info) => {
+                let view = Box::new(view_of(&info));
+                to.server = view.pointer();
+                return Ok(view);
+            }
         }
     }
+    Ok(Box::new(()))
 }
 
 /// Opens an observer of EW_FRAMES, EW_TRUTHS or EW_BELIEFS. The server never waits for observers, may start later than
@@ -262,32 +263,17 @@ pub extern "C" fn ew_next(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
-        let Reading { source, last } = &mut *hold(&of(samples)?.0, Samples::NAME)?;
-        let (world, limit) = (u32::try_from(world).ok(), duration(timeout));
-        let (nanos, n_lost, pid, content) = match source {
-            Source::Frames(observer) => observed(observer, world, limit, frame)?,
-            Source::Truths(observer) => observed(observer, world, limit, |it| truth(&it))?,
-            Source::Beliefs(observer) => observed(observer, world, limit, |it| belief(&it))?,
-            Source::Recording(reader) => recorded(reader, world)?,
+        let Reading { source, last } = &mut *hold(&of(samples)?.0)?;
+        let wanted = (u32::try_from(world).ok(), duration(timeout));
+        let mut sample = Sample::default();
+        let to = &mut sample;
+        let memory = match source {
+            Source::Frames(observer) => observed(observer, wanted, to, frame)?,
+            Source::Truths(observer) => observed(observer, wanted, to, truth)?,
+            Source::Beliefs(observer) => observed(observer, wanted, to, belief)?,
+            Source::Recording(reader) => recorded(reader, wanted.0, to)?,
         };
-        let content = Box::new(content);
-        let mut view = Sample {
-            nanos,
-            n_lost,
-            pid,
-            server: null(),
-            frame: null(),
-            truth: null(),
-            belief: null(),
-        };
-        match &*content {
-            Content::Server(of) => view.server = of.pointer(),
-            Content::Frame(of) => view.frame = of.pointer(),
-            Content::Truth(of) => view.truth = of.pointer(),
-            Content::Belief(of) => view.belief = of.pointer(),
-            Content::End => {}
-        }
-        keep(last, View::new(view, content), out);
+        keep(last, View::new(sample, memory), out);
         Ok(())
     })
 }

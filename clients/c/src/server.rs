@@ -1,19 +1,18 @@
 //! Servers: running ones, and worlds in this process.
 
-use crate::belief::{LeftView, Publisher};
-use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
+use crate::belief::LeftView;
+use crate::error::{Error, ErrorInfo, Outcome, guard};
 use crate::fork::watch_forks;
-use crate::handle::{Handle, duration, give, of, put, text};
+use crate::handle::{duration, give, of, put, text};
 use crate::info::{Info, InfoView, view_of};
 use crate::report::WorldReport;
 use emberwatch_messages::backend::Backend;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::ErrorClass;
 use emberwatch_messages::instance::Instance;
-use emberwatch_messages::limits::memory::NoMemory;
-use emberwatch_messages::limits::threads::NoThreads;
 use emberwatch_protocol::Connection;
-use emberwatch_sim::embedded::{Embedded, settings};
+use emberwatch_protocol::agent_belief::BeliefPublisher;
+use emberwatch_sim::embedded::Embedded;
 use serde_json::{Map, Value};
 use std::ffi::{CString, c_char};
 use std::ptr::null;
@@ -26,17 +25,12 @@ pub struct Server {
     kept: Mutex<Kept>,
 }
 
-impl Handle for Server {
-    const KIND: u32 = 0x4557_0001;
-    const NAME: &'static str = "server";
-}
-
 /// What leases share with their server.
 pub struct Core {
     pub info: ServerInfo,
     /// `None` for worlds in this process.
     pub instance: Option<Instance>,
-    pub publisher: Mutex<Option<Publisher>>,
+    pub publisher: Mutex<Option<BeliefPublisher>>,
     worlds: Mutex<Box<dyn Backend + Send>>,
 }
 
@@ -44,6 +38,7 @@ pub struct Core {
 #[derive(Default)]
 pub struct Kept {
     reply: CString,
+    states: Vec<u8>,
     pub reports: Vec<WorldReport>,
     pub left: Option<LeftView>,
 }
@@ -132,17 +127,9 @@ pub extern "C" fn ew_embed(
     guard(error, || {
         let given: Map<String, Value> = toml::from_str(text("settings", settings)?)
             .map_err(|error| Error::of_class(ErrorClass::Invalid, error))?;
-        let checked = settings::read(given)?;
         watch_forks();
-        let worlds = Embedded::new(checked).map_err(|error| {
-            let is_short = error.is::<NoMemory>() || error.is::<NoThreads>();
-            let class = if is_short {
-                ErrorClass::Memory
-            } else {
-                ErrorClass::Invalid
-            };
-            Error::of_class(class, format!("{error:#}"))
-        })?;
+        let worlds = Embedded::open(given);
+        let worlds = worlds.map_err(|error| Error::of_class(error.class(), error))?;
         Server::give(Box::new(worlds), None, out)
     })
 }
@@ -154,8 +141,9 @@ pub extern "C" fn ew_info_of(server: *mut Server) -> *const Info {
     of(server).map_or(null(), |server| server.info.pointer())
 }
 
-/// Sends a control request as JSON (PROTOCOL.md section 6), for requests that have no function here: snapshot, restore,
-/// fork (with the `lease` of an ew_answer; then call ew_observe) and shutdown. The reply lives until the next ew_control of this server.
+/// Sends a control request as JSON (PROTOCOL.md section 6), for requests that have no function here: snapshot, shutdown,
+/// and restore and fork, with the `lease` of an ew_answer, after which you call ew_observe. The reply lives until the
+/// next ew_control of this server.
 #[unsafe(no_mangle)]
 pub extern "C" fn ew_control(
     server: *mut Server,
@@ -166,8 +154,8 @@ pub extern "C" fn ew_control(
 ) -> i32 {
     guard(error, || {
         let (server, request) = (of(server)?, text("request", request)?.as_bytes());
-        let send = |backend: &mut dyn Backend| backend.control_text(request, duration(timeout));
-        let answer = CString::new(server.core.with(send)?);
+        let limit = duration(timeout);
+        let answer = CString::new(server.core.with(|it| it.control_text(request, limit))?);
         let mut kept = server.kept();
         kept.reply = answer.map_err(|error| Error::of_class(ErrorClass::BadAnswer, error))?;
         put(reply, kept.reply.as_ptr());
@@ -175,28 +163,21 @@ pub extern "C" fn ew_control(
     })
 }
 
-/// Copies the hidden states of a world in this process, row by row, to `states`. The setting `publish_truth` must be
-/// true. For evaluation and pictures, never for learners.
+/// Returns the hidden states of a world in this process, H * W bytes, if the setting `publish_truth` is true. They live
+/// until the next ew_states of this server. For evaluation and pictures, never for learners.
 #[unsafe(no_mangle)]
 pub extern "C" fn ew_states(
     server: *mut Server,
     world: u32,
-    states: *mut u8,
-    n_states: usize,
+    states: *mut *const u8,
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
-        let core = &of(server)?.core;
-        let n_cells = core.info.height * core.info.width;
-        if states.is_null() || n_states != n_cells {
-            return Err(invalid("states", format!("{n_cells} bytes"), n_states));
-        }
-        let worlds = world..world.saturating_add(1);
-        let truths = core.with(|backend| backend.truths(worlds))?;
-        // SAFETY: the caller passes an array of `n_states` bytes.
-        let to = unsafe { std::slice::from_raw_parts_mut(states, n_states) };
-        let found = truths.iter().flat_map(|(_, states)| states);
-        to.iter_mut().zip(found).for_each(|(to, &it)| *to = it);
+        let (server, worlds) = (of(server)?, world..world.saturating_add(1));
+        let truths = server.core.with(|backend| backend.truths(worlds))?;
+        let mut kept = server.kept();
+        kept.states = truths.into_iter().flat_map(|(_, grid)| grid).collect();
+        put(states, kept.states.as_ptr());
         Ok(())
     })
 }

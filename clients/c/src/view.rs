@@ -2,7 +2,6 @@
 
 use crate::handle::put;
 use std::ffi::{CString, c_char};
-use std::ptr::null;
 
 /// A struct of C, and the values to which it points.
 pub struct View<V, O> {
@@ -48,25 +47,11 @@ impl Texts {
         pointer
     }
 
-    /// Keeps a text; returns NULL without one.
-    pub fn add_option(&mut self, text: Option<&str>) -> *const c_char {
-        text.map_or(null(), |text| self.add(text))
-    }
-
     /// Keeps texts, and returns a pointer to an array of their pointers.
     pub fn add_all(&mut self, texts: &[String]) -> *const *const c_char {
         let list: Vec<_> = texts.iter().map(|text| self.add(text)).collect();
         let pointer = list.as_ptr();
         self.lists.push(list);
         pointer
-    }
-}
-
-/// Returns a pointer to values, or NULL without any.
-pub fn or_null<T>(values: &[T]) -> *const T {
-    if values.is_empty() {
-        null()
-    } else {
-        values.as_ptr()
     }
 }

@@ -1,10 +1,11 @@
 use std::path::Path;
 
 /// The sources of the header, in the order in which a program uses them.
-const SOURCES: [&str; 13] = [
+const SOURCES: [&str; 14] = [
     "../../protocol/messages/src/codes.rs",
     "../../protocol/messages/src/errors.rs",
     "../../protocol/messages/src/message.rs",
+    "../../protocol/model/src/path.rs",
     "src/error.rs",
     "src/info.rs",
     "src/server.rs",

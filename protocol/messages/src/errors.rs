@@ -265,10 +265,8 @@ pub fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // The message names a flag of the agent, the usual caller. Other callers might lack this flag.
                 Status::Busy => format!(
-                    "busy: held by pid {detail}; wait for its release, or take over with the flag \
-                     --takeover of `emberwatch-agent run`"
+                    "busy: held by pid {detail}; wait for its release, or take over (--takeover)"
                 ),
                 _ => message.unwrap_or_else(|| status.explain(detail)),
             };
