@@ -14,7 +14,7 @@
 // - Functions that can fail return 0, or a refusal of the server (an ew_status, positive; nothing changed), or a failure
 //   (an ew_failure, negative). They describe it in the ew_error of their last argument. It may be NULL, and so may
 //   every other pointer for a result, except for a new handle.
-// - Handles (ew_server, ew_lease, ew_frames, ew_truths, ew_beliefs, ew_recording) are freed by ew_free. Nothing else is:
+// - Handles (ew_server, ew_lease, ew_samples) are freed by ew_free. Nothing else is:
 //   all other pointers that a function returns belong to a handle, and live until the call that the function names.
 // - Threads may share an ew_server; its requests run one after another. Each other handle is for one thread at a time:
 //   a second one gets EW_FAILURE_IN_USE. Threads with a lease each may step at the same time only over connections of
@@ -35,6 +35,18 @@
 #define EW_ABI 1
 
 
+// Maximum number of moves in a path: 4096.
+#define MAX_MOVES 4096
+
+// Failure: the handle belongs to the process that forked this one.
+#define EW_FAILURE_FORKED -12
+
+// Failure: another thread is using this handle.
+#define EW_FAILURE_IN_USE -13
+
+// Failure: a bug in this library. Free the handle.
+#define EW_FAILURE_BUG -14
+
 // Bytes of the message of an ew_error, including its final 0.
 #define EW_MESSAGE_BYTES 496
 
@@ -46,6 +58,15 @@
 
 // If a world moved without these paths, returns what it shows now instead of EW_STATUS_LATE.
 #define EW_ACCEPT_LATE (1 << 16)
+
+// What an observer reads: the steps of all worlds.
+#define EW_FRAMES 1
+
+// What an observer reads: hidden states, which only a server with --publish-truth publishes.
+#define EW_TRUTHS 2
+
+// What an observer reads: the beliefs that agents publish.
+#define EW_BELIEFS 3
 
 // The status of an answer. Every rejection has a separate code and changes nothing.
 enum ew_status
@@ -112,38 +133,56 @@ typedef uint32_t ew_status;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// Failures of a call. Refusals of the server are positive: see ew_status.
+// A move of the robot to a neighbouring cell, an element of the paper's set `V`.
+enum ew_move
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint8_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+  // Row - 1.
+  EW_MOVE_UP = 0,
+  // Row + 1.
+  EW_MOVE_DOWN = 1,
+  // Column - 1.
+  EW_MOVE_LEFT = 2,
+  // Column + 1.
+  EW_MOVE_RIGHT = 3,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum ew_move ew_move;
+#else
+typedef uint8_t ew_move;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+// What a caller can do about an error. Clients in other languages have one exception or code for each; the numbers are
+// the codes of the C interface.
 enum ew_failure
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
   : int32_t
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
-  // An argument is wrong, or the worlds cannot do this; nothing changed.
+  // An argument is invalid, or the worlds cannot do this.
   EW_FAILURE_INVALID = -1,
-  // No server runs on the instance.
+  // No server runs on the instance. Waiting may help.
   EW_FAILURE_NO_SERVER = -2,
-  // The server has ended. Free all handles of the server, then attach again.
+  // The server ended. Connect again.
   EW_FAILURE_SERVER_GONE = -3,
-  // There was no answer, or no sample, in time.
+  // No answer or sample came in time.
   EW_FAILURE_TIMEOUT = -4,
-  // The check set by ew_interrupt_when ended the wait.
+  // The check for interrupts ended a wait.
   EW_FAILURE_INTERRUPTED = -5,
-  // The handle belongs to the process that forked this one.
-  EW_FAILURE_FORKED = -6,
-  // The channels in shared memory cannot be used.
-  EW_FAILURE_CHANNEL = -7,
-  // There is too little memory, or the system starts no thread.
-  EW_FAILURE_NO_MEMORY = -8,
-  // An answer or a sample is not valid, because it comes from another release; or a recording is damaged.
-  EW_FAILURE_BAD_ANSWER = -9,
-  // The server speaks another version of the protocol; detail: its version.
-  EW_FAILURE_OTHER_VERSION = -10,
-  // Another thread is using this handle.
-  EW_FAILURE_IN_USE = -11,
-  // The server runs in another PID namespace (another container).
-  EW_FAILURE_OTHER_PID_NAMESPACE = -12,
-  // A bug in this library. Free the handle.
-  EW_FAILURE_BUG = -13,
+  // A channel in shared memory could not be opened or used.
+  EW_FAILURE_CHANNEL = -6,
+  // There is too little memory, or no thread could be started.
+  EW_FAILURE_MEMORY = -7,
+  // An answer or a sample is invalid.
+  EW_FAILURE_BAD_ANSWER = -8,
+  // The server speaks another version of the protocol.
+  EW_FAILURE_OTHER_VERSION = -9,
+  // The server is in another PID namespace.
+  EW_FAILURE_OTHER_PID_NAMESPACE = -10,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -153,43 +192,20 @@ typedef int32_t ew_failure;
 #endif // __STDC_VERSION__ >= 202311L
 #endif // __cplusplus
 
-// The values of a move in a path.
-typedef enum ew_move {
-  // Row - 1.
-  EW_MOVE_UP = 0,
-  // Row + 1.
-  EW_MOVE_DOWN = 1,
-  // Column - 1.
-  EW_MOVE_LEFT = 2,
-  // Column + 1.
-  EW_MOVE_RIGHT = 3,
-} ew_move;
-
-// An observer of beliefs. One thread at a time may use it.
-typedef struct ew_beliefs ew_beliefs;
-
-// An observer of frames. One thread at a time may use it.
-typedef struct ew_frames ew_frames;
-
 // A lease. One thread at a time may use it; threads may use different leases of one server.
 typedef struct ew_lease ew_lease;
 
-// A recording that is being read. One thread at a time may use it.
-typedef struct ew_recording ew_recording;
+// An observer or a recording. One thread at a time may use it.
+typedef struct ew_samples ew_samples;
 
 // A connection to a server, or worlds in this process. Threads may share it; requests run one after another.
 typedef struct ew_server ew_server;
-
-// An observer of hidden states. One thread at a time may use it.
-typedef struct ew_truths ew_truths;
 
 // What went wrong. Pass a pointer to one, or NULL. A call that succeeds does not write it.
 typedef struct ew_error {
   // The returned code.
   int32_t code;
-  // Always 0.
-  uint32_t reserved;
-  // The detail of an ew_status, otherwise 0.
+  // The detail of an ew_status; the server's version for EW_FAILURE_OTHER_VERSION; otherwise 0.
   uint64_t detail;
   // A sentence in UTF-8, ended by 0 and cut if it is too long.
   char message[EW_MESSAGE_BYTES];
@@ -197,15 +213,13 @@ typedef struct ew_error {
 
 // The settings of a server.
 typedef struct ew_info {
-  // Version of the protocol.
-  uint32_t protocol;
   // The server's process.
   uint32_t pid;
   // Rows of the grid, H.
   uint32_t height;
   // Columns of the grid, W.
   uint32_t width;
-  // Moves of a path, T.
+  // Moves of a path.
   uint32_t n_moves;
   // Worlds.
   uint32_t n_worlds;
@@ -213,12 +227,10 @@ typedef struct ew_info {
   uint32_t n_robots;
   // Values in frames are below this number, or 255 where nothing was observed.
   uint32_t n_observations;
-  // Names of the observations.
-  const char *const *observations;
   // States of the model, S; 0 if the server hides it.
   uint32_t n_states;
-  // Rows and columns that robots see beyond the cells of their path.
-  uint32_t radius;
+  // Names of the observations.
+  const char *const *observations;
   // Names of the states; NULL if hidden.
   const char *const *states;
   // Reward of a cell in each state; NULL if hidden.
@@ -233,14 +245,12 @@ typedef struct ew_info {
   const char *task;
   // Identifies the worlds, 16 hexadecimal digits; NULL from old servers.
   const char *worlds_fingerprint;
-  // Steps simulated before k = 0.
-  uint64_t burn_in;
   // Length of an episode; 0: never truncated.
   uint64_t max_steps;
-  // Default life of an unused lease, milliseconds.
-  uint64_t lease_millis;
   // Time that a world waits for late paths, milliseconds; 0: no deadline.
   uint64_t deadline_millis;
+  // Rows and columns that robots see beyond the cells of their path.
+  uint32_t radius;
   // Frames show 0: the path, 1: every cell, 2: the path, or every cell with EW_FULL_COVERAGE.
   uint32_t coverage;
   // Hidden states are published.
@@ -315,8 +325,8 @@ typedef struct ew_answer {
   uint32_t height;
   // Columns of the grid, W.
   uint32_t width;
-  // Always 0.
-  uint32_t reserved;
+  // Number of the lease, for ew_control.
+  uint64_t lease;
   // The result of each world.
   const struct ew_world_result *worlds;
   // The result of each robot.
@@ -337,56 +347,39 @@ typedef struct ew_world_report {
   uint64_t seed;
   // Resets since the server started.
   uint64_t episode;
+  // Robots that a client holds.
+  uint32_t n_held;
   // Robots that have a path for the next step.
   uint32_t n_paths;
   // The world is being reset.
   bool resetting;
 } ew_world_report;
 
-// The state of a server.
-typedef struct ew_report {
-  // Time since the server started.
-  uint64_t uptime_millis;
-  // Steps of all worlds since then.
-  uint64_t n_steps;
-  // Steps per second, over about the last second.
-  double steps_per_second;
-  // Refused requests.
-  uint64_t n_refused;
-  // Clients.
-  uint32_t n_clients;
-  // Observers.
-  uint32_t n_observers;
-  // Number of worlds.
-  uint32_t n_worlds;
-  // Number of robots of all worlds.
+// Header of a sample on `frames`: one step of one world. The payload is `n_robots` RobotResults, one frame of
+// `height * width` bytes per robot, then each robot's path of n_moves bytes.
+typedef struct ew_frame_header {
+  // VERSION.
+  uint32_t version;
+  // The world.
+  uint32_t world;
+  // Number of earlier samples on this channel. A gap means lost samples.
+  uint64_t sequence;
+  // Number of the world's first robot.
+  uint32_t first_robot;
+  // Number of robots R of the world.
   uint32_t n_robots;
-  // The worlds.
-  const struct ew_world_report *worlds;
-  // The process that holds each robot; 0: none.
-  const uint32_t *holders;
-  // Row and column of each robot.
-  const uint32_t (*cells)[2];
-} ew_report;
+  // Grid height H.
+  uint32_t height;
+  // Grid width W.
+  uint32_t width;
+  // The world's result.
+  struct ew_world_result result;
+} ew_frame_header;
 
 // One step of one world, as the server published it.
 typedef struct ew_frame {
-  // The world.
-  uint32_t world;
-  // Number of its first robot.
-  uint32_t first_robot;
-  // Robots of the world.
-  uint32_t n_robots;
-  // Rows of the grid, H.
-  uint32_t height;
-  // Columns of the grid, W.
-  uint32_t width;
-  // Process of the server; 0 if it is unknown.
-  uint32_t pid;
-  // Samples that were lost right before this one, because the observer was too slow.
-  uint64_t n_lost;
-  // The result of the world.
-  struct ew_world_result result;
+  // World, robots, grid and the world's result.
+  struct ew_frame_header header;
   // The result of each robot.
   const struct ew_robot_result *robots;
   // n_robots * H * W bytes.
@@ -395,59 +388,74 @@ typedef struct ew_frame {
   const uint8_t *paths;
 } ew_frame;
 
-// The hidden states of one world.
-typedef struct ew_truth {
+// Header of a sample on `truth`; the payload is the hidden state (`height * width` bytes).
+typedef struct ew_truth_header {
+  // VERSION.
+  uint32_t version;
   // The world.
   uint32_t world;
-  // Rows of the grid, H.
-  uint32_t height;
-  // Columns of the grid, W.
-  uint32_t width;
-  // Always 0.
-  uint32_t reserved;
-  // The step k.
+  // Number of earlier samples on this channel. A gap means lost samples.
+  uint64_t sequence;
+  // Number of resets of this world since the server started.
+  uint64_t episode;
+  // Step index k of the state.
   uint64_t step;
   // Seed of the episode.
   uint64_t seed;
-  // Resets since the server started.
-  uint64_t episode;
-  // Samples that were lost right before this one.
-  uint64_t n_lost;
+  // Grid height H.
+  uint32_t height;
+  // Grid width W.
+  uint32_t width;
+} ew_truth_header;
+
+// The hidden states of one world. For evaluation and pictures, never for learners.
+typedef struct ew_truth {
+  // World, episode, step and grid.
+  struct ew_truth_header header;
   // H * W states.
   const uint8_t *states;
 } ew_truth;
 
-// A belief that an agent published.
-typedef struct ew_belief {
+// Header of a sample on `agent`; the payload is a belief (`n_states * height * width` floats), then
+// JSON, an Intent.
+typedef struct ew_belief_header {
+  // VERSION.
+  uint32_t version;
   // The world.
   uint32_t world;
-  // Number of the first robot that flies by the belief.
-  uint32_t first_robot;
-  // Robots that fly by it.
-  uint32_t n_robots;
-  // Rows of the grid, H.
-  uint32_t height;
-  // Columns of the grid, W.
-  uint32_t width;
-  // States of the belief, S.
-  uint32_t n_states;
-  // Number of names in `states`.
-  uint32_t n_names;
-  // The agent's process.
-  uint32_t pid;
-  // The step k that the belief is about.
+  // Number of earlier samples of this agent. A gap means lost samples.
+  uint64_t sequence;
+  // Number of resets of this world since the server started.
+  uint64_t episode;
+  // Step index k of the state that the belief describes.
   uint64_t step;
   // Seed of the episode.
   uint64_t seed;
-  // Resets since the server started.
-  uint64_t episode;
-  // Samples that were lost right before this one.
-  uint64_t n_lost;
-  // S * H * W probabilities, state by state.
+  // Grid height H.
+  uint32_t height;
+  // Grid width W.
+  uint32_t width;
+  // Number of states S of the belief.
+  uint32_t n_states;
+  // The agent's process id.
+  uint32_t pid;
+  // Number of the first robot that the agent flies.
+  uint32_t first_robot;
+  // Number of consecutive robots that the agent flies, at least 1.
+  uint32_t n_robots;
+} ew_belief_header;
+
+// A belief that an agent published.
+typedef struct ew_belief {
+  // World, robots, episode, step, grid, and the agent's process.
+  struct ew_belief_header header;
+  // n_states * H * W probabilities, state by state.
   const float *belief;
   // Names of the states.
   const char *const *states;
-  // Name of the policy; "" if unknown, as the two below.
+  // Their number, which may differ from n_states.
+  uint32_t n_names;
+  // Name of the policy; "" if unknown, as the texts below.
   const char *policy;
   // What computed the belief.
   const char *belief_from;
@@ -457,17 +465,23 @@ typedef struct ew_belief {
   double plan_millis;
 } ew_belief;
 
-// A record of a recording: exactly one of `server`, `frame` and `truth` is not NULL, except at the end.
-typedef struct ew_record {
-  // Nanoseconds since the recording began.
+// A sample. One of the pointers is not NULL, except at the end of a recording.
+typedef struct ew_sample {
+  // Nanoseconds since a recording began; 0 from an observer.
   uint64_t nanos;
-  // The server of the next records.
+  // Samples that were lost right before this one.
+  uint64_t n_lost;
+  // Process that published it; 0 if it is unknown.
+  uint32_t pid;
+  // In recordings: the server of the next samples.
   const struct ew_info *server;
   // One step of one world.
   const struct ew_frame *frame;
   // Hidden states.
   const struct ew_truth *truth;
-} ew_record;
+  // A belief.
+  const struct ew_belief *belief;
+} ew_sample;
 
 // What a display shows about the agent behind a belief. Pointers may be NULL.
 typedef struct ew_intent {
@@ -502,6 +516,9 @@ typedef struct ew_left {
 // Returns true to end a wait.
 typedef bool (*ew_interrupt_check)(void);
 
+// All moves, in the order of their wire values.
+#define ew_move_ALL { ew_move_Up, ew_move_Down, ew_move_Left, ew_move_Right, }
+
 #ifdef __cplusplus
 extern "C" {
 #endif // __cplusplus
@@ -532,35 +549,21 @@ int32_t ew_embed(const char *settings,
 // NULL if `server` is no server of this process.
 const struct ew_info *ew_info_of(struct ew_server *server);
 
-// Sends a control request as JSON (PROTOCOL.md section 6), for requests that have no function here, such as snapshots
-// and shutdown. The reply lives until the next ew_control of this server.
+// Sends a control request as JSON (PROTOCOL.md section 6), for requests that have no function here: snapshot, shutdown,
+// and restore and fork, with the `lease` of an ew_answer, after which you call ew_observe. The reply lives until the
+// next ew_control of this server.
 int32_t ew_control(struct ew_server *server,
                    const char *request,
                    double timeout,
                    const char **reply,
                    struct ew_error *error);
 
-// Copies the hidden states of a world in this process, row by row, to `states`. The setting `publish_truth` must be
-// true. For evaluation and pictures, never for learners.
+// Returns the hidden states of a world in this process, H * W bytes, if the setting `publish_truth` is true. They live
+// until the next ew_states of this server. For evaluation and pictures, never for learners.
 int32_t ew_states(struct ew_server *server,
                   uint32_t world,
-                  uint8_t *states,
-                  size_t n_states,
+                  const uint8_t **states,
                   struct ew_error *error);
-
-// Returns the state of all worlds in this process as bytes, for ew_restore_state. They live until the next call of
-// this function with this server.
-int32_t ew_clone_state(struct ew_server *server,
-                       const uint8_t **bytes,
-                       size_t *n_bytes,
-                       struct ew_error *error);
-
-// Replaces all worlds in this process with the worlds of ew_clone_state. They continue exactly as those would have.
-// Call ew_observe with each lease before its next ew_step.
-int32_t ew_restore_state(struct ew_server *server,
-                         const uint8_t *bytes,
-                         size_t n_bytes,
-                         struct ew_error *error);
 
 // Acquires the right to fly consecutive robots, and waits for the burn-in of their worlds. Robots of other clients are
 // refused with EW_STATUS_BUSY, or taken over if `takeover` is set. The lease ends `seconds_to_live` after its last use;
@@ -612,81 +615,41 @@ int32_t ew_recall(struct ew_lease *lease,
                   const struct ew_answer **out,
                   struct ew_error *error);
 
-// Replaces all worlds of the lease with worlds of a snapshot file on the server's host, from index `from` of the file
-// on. `path` must be absolute. The request `snapshot` of ew_control writes such files.
-int32_t ew_restore(struct ew_lease *lease,
-                   const char *path,
-                   uint32_t from,
-                   double timeout,
-                   const struct ew_answer **out,
-                   struct ew_error *error);
-
-// Replaces the world `to` of the lease with a copy of the world `from`. With the same paths, both have the same future.
-int32_t ew_copy_world(struct ew_lease *lease,
-                      uint32_t from,
-                      uint32_t to,
-                      double timeout,
-                      const struct ew_answer **out,
-                      struct ew_error *error);
-
 // Restarts the time until the lease ends, without flying.
 int32_t ew_renew(struct ew_lease *lease, double timeout, struct ew_error *error);
 
 // Returns the robots to the server. The handle must still be freed.
 int32_t ew_release(struct ew_lease *lease, double timeout, struct ew_error *error);
 
-// Asks for the state of the server and its worlds. The report lives until the next ew_status_of of this server.
+// Asks for the state of all worlds, as many as `n_worlds` of ew_info. It lives until the next ew_status_of of this
+// server. The request `status` of ew_control also tells clients, holders and speed.
 int32_t ew_status_of(struct ew_server *server,
                      double timeout,
-                     const struct ew_report **out,
+                     const struct ew_world_report **worlds,
                      struct ew_error *error);
 
-// Opens the frames of an instance, whose server may start later. The server never waits for observers, and an observer
-// survives its server: it shows the next one of the instance.
-int32_t ew_observe_frames(const char *instance,
-                          struct ew_frames **out,
-                          struct ew_error *error);
+// Opens an observer of EW_FRAMES, EW_TRUTHS or EW_BELIEFS. The server never waits for observers, may start later than
+// they, and may be restarted: an observer shows the next server of the instance.
+int32_t ew_watch(const char *instance,
+                 uint32_t what,
+                 struct ew_samples **out,
+                 struct ew_error *error);
 
-// Waits for the next frame of a world, or of any world if `world` is negative. It lives until the next call with this
-// observer. EW_FAILURE_TIMEOUT: none came.
-int32_t ew_next_frame(struct ew_frames *frames,
-                      int64_t world,
-                      double timeout,
-                      const struct ew_frame **out,
-                      struct ew_error *error);
+// Opens a recording, a file of `emberwatch-server record`. Needs no server.
+int32_t ew_open_recording(const char *path, struct ew_samples **out, struct ew_error *error);
 
-// Opens the hidden states of an instance, which only a server with --publish-truth publishes.
-int32_t ew_observe_truths(const char *instance, struct ew_truths **out, struct ew_error *error);
-
-// Waits for the next hidden states, as ew_next_frame does for frames.
-int32_t ew_next_truth(struct ew_truths *truths,
-                      int64_t world,
-                      double timeout,
-                      const struct ew_truth **out,
-                      struct ew_error *error);
-
-// Opens the beliefs that the agents of an instance publish.
-int32_t ew_observe_beliefs(const char *instance, struct ew_beliefs **out, struct ew_error *error);
-
-// Waits for the next belief about a world, as ew_next_frame does for frames.
-int32_t ew_next_belief(struct ew_beliefs *beliefs,
-                       int64_t world,
-                       double timeout,
-                       const struct ew_belief **out,
-                       struct ew_error *error);
-
-// Opens a recording. Needs no server.
-int32_t ew_open_recording(const char *path, struct ew_recording **out, struct ew_error *error);
-
-// Reads the next record, which lives until the next call with this recording. At the end, all its pointers are NULL.
-// EW_FAILURE_BAD_ANSWER: the file is damaged or cut short here; the records before are good.
-int32_t ew_next_record(struct ew_recording *recording,
-                       const struct ew_record **out,
-                       struct ew_error *error);
+// Returns the next sample about a world, or about any world if `world` is negative. It lives until the next call with
+// these samples. An observer waits for it: EW_FAILURE_TIMEOUT if none came. At the end of a recording, all pointers of
+// the sample are NULL; EW_FAILURE_BAD_ANSWER: it is damaged or cut short here, and all before is good.
+int32_t ew_next(struct ew_samples *samples,
+                int64_t world,
+                double timeout,
+                const struct ew_sample **out,
+                struct ew_error *error);
 
 // Publishes a belief about a world after its last answer, for dashboards: n_states * H * W probabilities, state by
-// state. The robots of the world from `first_robot` on fly by it. The call does nothing without readers, within 20 ms
-// of the last belief about `first_robot`, and for worlds in this process. `intent` may be NULL.
+// state. The robots of the world from `first_robot` on fly by it. The call does nothing without readers, and for
+// worlds in this process. `intent` may be NULL.
 int32_t ew_publish_belief(struct ew_lease *lease,
                           uint32_t first_robot,
                           uint32_t n_robots,
