@@ -55,7 +55,12 @@ fn run(folder: &Folder, source: &str, flags: &str, arguments: &[&str]) -> Ended 
 }
 
 fn run_in_process(flags: &str) {
-    let ended = run(&Folder::default(), "tests/programs/in_process.c", flags, &[]);
+    let ended = run(
+        &Folder::default(),
+        "tests/programs/in_process.c",
+        flags,
+        &[],
+    );
     ended.check_prints("pipe as model");
 }
 
@@ -70,10 +75,16 @@ fn run_attached(flags: &str) {
 
 #[test]
 fn the_header_compiles_as_c_and_cpp_of_all_years() {
-    for standard in ["c99", "c11", "c17", "c2x", "c++11", "c++14", "c++17", "c++20"] {
+    for standard in [
+        "c99", "c11", "c17", "c2x", "c++11", "c++14", "c++17", "c++20",
+    ] {
         let flags = format!("-std={standard} -fsyntax-only");
         let language = if standard.contains("++") { "c++" } else { "c" };
-        compile("include/emberwatch.h", &format!("-x {language} {flags}"), "");
+        compile(
+            "include/emberwatch.h",
+            &format!("-x {language} {flags}"),
+            "",
+        );
     }
 }
 
@@ -93,7 +104,12 @@ fn a_second_copy_of_the_library_is_refused() {
     let copy = folder.word("copy.so");
     std::fs::copy(library(), &copy).expect("a copy");
     let arguments = [server.instance.name(), &copy];
-    run(&folder, "tests/programs/second_copy.c", "-std=gnu11", &arguments);
+    run(
+        &folder,
+        "tests/programs/second_copy.c",
+        "-std=gnu11",
+        &arguments,
+    );
 }
 
 #[test]
@@ -131,12 +147,12 @@ mod python {
         let instance = server.instance.name();
         let watch = format!(
             "import emberwatch\n\
-             with emberwatch.FrameObserver({instance:?}) as frames:\n    \
-             while frames.receive(timeout=20).world.step < 10: pass\n"
+             with emberwatch.observe({instance:?}, timeout=20) as frames:\n    \
+             print(max(frame.result.step for frame, _ in zip(frames, range(15))) > 10)\n"
         );
         let watcher = Program::start_at(&tests::harness::python(), &["-c", &watch]);
         let node = start(&folder, "examples/node.c", "-std=c99", &[instance, "3"]);
-        watcher.ends(0);
+        watcher.ends(0).check_prints("True");
         node.ends(0).check_prints("k = 30 after 30 steps");
     }
 }
