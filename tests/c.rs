@@ -36,17 +36,25 @@ fn compile(source: &str, before: &str, after: &str) {
     assert!(compiled.status.success(), "{compiler} {source}: {said}");
 }
 
-/// Compiles a program with the library, and starts it.
-fn start(folder: &Folder, source: &str, flags: &str, arguments: &[&str]) -> Program {
+/// Returns the library's path below a folder, where it has its soname.
+fn link(folder: &Folder) -> String {
     let link = folder.path("libemberwatch.so.1");
     if !link.exists() {
-        std::os::unix::fs::symlink(library(), &link).expect("a link with the soname");
+        std::os::unix::fs::symlink(library(), &link).expect("a link");
     }
+    folder.word("libemberwatch.so.1")
+}
+
+/// Compiles a program with the library, and starts it.
+fn start(folder: &Folder, source: &str, flags: &str, arguments: &[&str]) -> Program {
     let name = Path::new(source).file_stem().expect("a name");
     let program = folder.path(&name.to_string_lossy());
-    let (library, program_name) = (link.display(), program.display());
-    let links = format!("{library} -Wl,-rpath,{} -ldl -pthread", folder.word(""));
-    compile(source, flags, &format!("-o {program_name} {links}"));
+    let links = format!(
+        "{} -Wl,-rpath,{} -ldl -pthread",
+        link(folder),
+        folder.word("")
+    );
+    compile(source, flags, &format!("-o {} {links}", program.display()));
     Program::start_at(&program, arguments)
 }
 
@@ -155,6 +163,27 @@ mod python {
         watcher.ends(0).check_prints("True");
         node.ends(0).check_prints("k = 30 after 30 steps");
     }
+}
+
+#[test]
+#[ignore = "needs Go"]
+fn the_example_in_go_flies_in_the_process() {
+    let (folder, example) = (Folder::default(), "clients/c/examples/random.go");
+    let library = format!("{} -Wl,-rpath,{}", link(&folder), folder.word(""));
+    let include = repository().join("clients/c/include");
+    let program = folder.word("random_go");
+    let built = Command::new("go")
+        .args(["build", "-o", &program])
+        .arg(repository().join(example))
+        .env("CGO_CFLAGS", format!("-I{}", include.display()))
+        .env("CGO_LDFLAGS", library)
+        .env("CGO_LDFLAGS_ALLOW", ".*")
+        .output()
+        .expect("Go; scripts/test --all installs it");
+    let said = String::from_utf8_lossy(&built.stderr);
+    assert!(built.status.success(), "{said}");
+    let ended = Program::start_at(Path::new(&program), &[]).wait(LIMIT);
+    ended.check(0).check_prints("mean reward ");
 }
 
 #[test]

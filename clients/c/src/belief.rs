@@ -1,12 +1,12 @@
 //! Beliefs: published for displays, and left for a robot's next agent.
 
 use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
-use crate::handle::{array, duration, of, text};
+use crate::handle::{array, duration, of, put, text};
 use crate::lease::LeaseHandle;
 use crate::server::{Core, Server};
-use crate::view::{Texts, View, keep};
+use crate::view::{Texts, View};
 use emberwatch_messages::agent_belief::{Intent as WireIntent, MAX_STATES};
-use emberwatch_messages::left_belief::{self, LeftBelief};
+use emberwatch_messages::left_belief;
 use emberwatch_messages::message::{AgentHeader, Status, worlds_of};
 use emberwatch_model::grid::Probabilities;
 use emberwatch_protocol::agent_belief::BeliefPublisher;
@@ -45,8 +45,6 @@ pub struct Left {
     /// The step k that the belief is about.
     pub step: u64,
 }
-
-pub type LeftView = View<Left, (Texts, LeftBelief)>;
 
 /// Converts what C says about a belief of `n_states` states.
 fn intent_of(core: &Core, n_states: usize, given: &Intent) -> Outcome<WireIntent> {
@@ -185,7 +183,9 @@ pub extern "C" fn ew_left_belief(
             episode: left.info.episode,
             step: left.info.step,
         };
-        keep(&mut server.kept().left, View::new(view, (texts, left)), out);
+        let view = Box::new(View::new(view, (texts, left)));
+        put(out, view.pointer());
+        server.keep(view);
         Ok(())
     })
 }

@@ -54,9 +54,9 @@ pub extern "C" fn ew_status_of(
         let Reply::Status(status) = reply else {
             return Err(unexpected("status", &reply).into());
         };
-        let mut kept = server.kept();
-        kept.reports = status.worlds.iter().map(WorldReport::from).collect();
-        put(worlds, kept.reports.as_ptr());
+        let reports: Vec<WorldReport> = status.worlds.iter().map(WorldReport::from).collect();
+        put(worlds, reports.as_ptr());
+        server.keep(reports);
         Ok(())
     })
 }

@@ -1,11 +1,9 @@
 //! Servers: running ones, and worlds in this process.
 
-use crate::belief::LeftView;
 use crate::error::{Error, ErrorInfo, Outcome, guard};
 use crate::fork::watch_forks;
 use crate::handle::{duration, give, of, put, text};
 use crate::info::{Info, InfoView, view_of};
-use crate::report::WorldReport;
 use emberwatch_messages::backend::Backend;
 use emberwatch_messages::control::ServerInfo;
 use emberwatch_messages::errors::ErrorClass;
@@ -14,15 +12,18 @@ use emberwatch_protocol::Connection;
 use emberwatch_protocol::agent_belief::BeliefPublisher;
 use emberwatch_sim::embedded::Embedded;
 use serde_json::{Map, Value};
+use std::any::{Any, TypeId};
+use std::collections::HashMap;
 use std::ffi::{CString, c_char};
 use std::ptr::null;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// A connection to a server, or worlds in this process. Threads may share it; requests run one after another.
 pub struct Server {
     pub core: Arc<Core>,
     info: InfoView,
-    kept: Mutex<Kept>,
+    /// The last reply of each type, to which C has pointers.
+    kept: Mutex<HashMap<TypeId, Box<dyn Any + Send>>>,
 }
 
 /// What leases share with their server.
@@ -32,15 +33,6 @@ pub struct Core {
     pub instance: Option<Instance>,
     pub publisher: Mutex<Option<BeliefPublisher>>,
     worlds: Mutex<Box<dyn Backend + Send>>,
-}
-
-/// The last replies, to which C has pointers.
-#[derive(Default)]
-pub struct Kept {
-    reply: CString,
-    states: Vec<u8>,
-    pub reports: Vec<WorldReport>,
-    pub left: Option<LeftView>,
 }
 
 impl Core {
@@ -77,8 +69,10 @@ impl Server {
         give(server, to)
     }
 
-    pub fn kept(&self) -> MutexGuard<'_, Kept> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Keeps a reply until the next one of its type.
+    pub fn keep<T: Send + 'static>(&self, reply: T) {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        kept.insert(TypeId::of::<T>(), Box::new(reply));
     }
 }
 
@@ -156,9 +150,9 @@ pub extern "C" fn ew_control(
         let (server, request) = (of(server)?, text("request", request)?.as_bytes());
         let limit = duration(timeout);
         let answer = CString::new(server.core.with(|it| it.control_text(request, limit))?);
-        let mut kept = server.kept();
-        kept.reply = answer.map_err(|error| Error::of_class(ErrorClass::BadAnswer, error))?;
-        put(reply, kept.reply.as_ptr());
+        let answer = answer.map_err(|error| Error::of_class(ErrorClass::BadAnswer, error))?;
+        put(reply, answer.as_ptr());
+        server.keep(answer);
         Ok(())
     })
 }
@@ -175,9 +169,9 @@ pub extern "C" fn ew_states(
     guard(error, || {
         let (server, worlds) = (of(server)?, world..world.saturating_add(1));
         let truths = server.core.with(|backend| backend.truths(worlds))?;
-        let mut kept = server.kept();
-        kept.states = truths.into_iter().flat_map(|(_, grid)| grid).collect();
-        put(states, kept.states.as_ptr());
+        let found: Vec<u8> = truths.into_iter().flat_map(|(_, grid)| grid).collect();
+        put(states, found.as_ptr());
+        server.keep(found);
         Ok(())
     })
 }
