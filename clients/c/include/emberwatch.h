@@ -642,7 +642,7 @@ int32_t ew_open_recording(const char *path, struct ew_samples **out, struct ew_e
 // these samples. An observer waits for it: EW_FAILURE_TIMEOUT if none came. At the end of a recording, all pointers of
 // the sample are NULL; EW_FAILURE_BAD_ANSWER: it is damaged or cut short here, and all before is good.
 int32_t ew_next(struct ew_samples *samples,
-                int64_t world,
+                int32_t world,
                 double timeout,
                 const struct ew_sample **out,
                 struct ew_error *error);

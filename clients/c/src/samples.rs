@@ -257,7 +257,7 @@ pub extern "C" fn ew_open_recording(
 #[unsafe(no_mangle)]
 pub extern "C" fn ew_next(
     samples: *mut Samples,
-    world: i64,
+    world: i32,
     timeout: f64,
     out: *mut *const Sample,
     error: *mut ErrorInfo,
