@@ -4,7 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use tests::harness::{
-    Ended, Folder, LIMIT, Program, SERVER, SMALL, Server, new_instance, program_path, repository,
+    Ended, Folder, LIMIT, PATIENCE, Program, SERVER, SMALL, Server, eventually, new_instance,
+    program_path, repository, status,
 };
 
 const SANITIZERS: &str = "-fsanitize=address,undefined -fno-sanitize-recover=undefined";
@@ -142,6 +143,20 @@ fn the_node_flies_at_10_hz_beside_a_late_teammate() {
     let instance = server.instance.name();
     let ended = run(&folder, "examples/node.c", "-std=c99", &[instance, "2"]);
     ended.check_prints("k = 20 after 20 steps");
+}
+
+#[test]
+fn the_node_survives_a_restart_of_its_server() {
+    let (folder, instance) = (Folder::default(), new_instance());
+    let first = Server::start_on(&instance, "--burn-in 0");
+    let arguments = [instance.name(), "4"];
+    let node = start(&folder, "examples/node.c", "-std=c99", &arguments);
+    let has_flown = || status(&instance).is_ok_and(|status| status.n_steps > 2);
+    assert!(eventually(PATIENCE, has_flown), "{}", node.stderr());
+    first.kill();
+    let _second = Server::start_on(&instance, "--burn-in 0");
+    let ended = node.ends(0);
+    ended.check_prints("after 40 steps").check_says("is gone");
 }
 
 /// Needs the Python package, which `scripts/test` installs.

@@ -1,5 +1,5 @@
 // Flies a robot at 10 Hz beside other clients, like a node of a robot: ./node INSTANCE SECONDS
-// Teammates that are late, a takeover and a restart of the server do not stop it.
+// Late teammates, a takeover of its robot and a restart of the server do not end it.
 #define _POSIX_C_SOURCE 200809L
 #include <emberwatch.h>
 #include <stdio.h>
@@ -17,7 +17,7 @@ static int32_t begin(const char *instance, const ew_answer **seen) {
     lease = NULL;
     server = NULL;
     int32_t code = ew_attach(instance, "node.c", 1, 1, &server, &error);
-    if (code == 0) code = ew_acquire(server, 0, 1, true, 2, 60, &lease, &error);
+    if (code == 0) code = ew_acquire(server, 0, 1, false, 2, 60, &lease, &error);
     if (code == 0) code = ew_observe(lease, 0, 1, seen, &error);
     return code;
 }
