@@ -11,8 +11,8 @@
 
 // Rules
 //
-// - Functions that can fail return 0, or a refusal of the server (an ew_status, positive; nothing changed), or a failure
-//   (an ew_failure, negative). They describe it in the ew_error of their last argument. It may be NULL, and so may
+// - Functions that can fail return 0, or a refusal of the server (an ew_status, positive; nothing changed), or a
+//   failure (an ew_failure, negative). They describe it in the ew_error of their last argument. It may be NULL, and so may
 //   every other pointer for a result, except for a new handle.
 // - Handles (ew_server, ew_lease, ew_samples) are freed by ew_free. Nothing else is:
 //   all other pointers that a function returns belong to a handle, and live until the call that the function names.
@@ -566,8 +566,8 @@ int32_t ew_states(struct ew_server *server,
                   struct ew_error *error);
 
 // Acquires the right to fly consecutive robots, and waits for the burn-in of their worlds. Robots of other clients are
-// refused with EW_STATUS_BUSY, or taken over if `takeover` is set. The lease ends `seconds_to_live` after its last use;
-// 0: the server's default. To continue an episode, call ew_observe; to begin one, ew_reset.
+// refused with EW_STATUS_BUSY, or taken over if `takeover` is set. The lease ends `seconds_to_live` after its last
+// use; 0: the server's default. To continue an episode, call ew_observe; to begin one, ew_reset.
 int32_t ew_acquire(struct ew_server *server,
                    uint32_t first_robot,
                    uint32_t n_robots,
@@ -578,8 +578,8 @@ int32_t ew_acquire(struct ew_server *server,
                    struct ew_error *error);
 
 // Starts a new episode in each world of the lease. `seeds` has one seed per world, or is NULL: then the server derives
-// them. Waits for the burn-in, which can take a while: use a timeout of minutes. The answer shows the robots' cells and
-// empty frames. This answer, and those of the functions below, live until the next call with the lease.
+// them. Waits for the burn-in, which can take a while: use a timeout of minutes. The answer shows the robots' cells
+// and empty frames. This answer, and those of the functions below, live until the next call with the lease.
 int32_t ew_reset(struct ew_lease *lease,
                  const uint64_t *seeds,
                  size_t n_seeds,
@@ -682,8 +682,8 @@ int32_t ew_left_belief(struct ew_server *server,
 void ew_interrupt_when(ew_interrupt_check check);
 
 // Frees any handle of this library; NULL does nothing. Handles may be freed in any order: a connection closes when its
-// server and all its leases are freed. Freeing a lease releases its robots, which takes up to a second if the server is
-// stopped. In the child of a fork, it only forgets the handle. No other thread may be using the handle.
+// server and all its leases are freed. Freeing a lease releases its robots, which takes up to a second if the server
+// is stopped. In the child of a fork, it only forgets the handle. No other thread may be using the handle.
 void ew_free(void *handle);
 
 #ifdef __cplusplus

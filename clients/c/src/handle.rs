@@ -106,8 +106,8 @@ pub fn duration(seconds: f64) -> Duration {
 }
 
 /// Frees any handle of this library; NULL does nothing. Handles may be freed in any order: a connection closes when its
-/// server and all its leases are freed. Freeing a lease releases its robots, which takes up to a second if the server is
-/// stopped. In the child of a fork, it only forgets the handle. No other thread may be using the handle.
+/// server and all its leases are freed. Freeing a lease releases its robots, which takes up to a second if the server
+/// is stopped. In the child of a fork, it only forgets the handle. No other thread may be using the handle.
 #[unsafe(no_mangle)]
 pub extern "C" fn ew_free(handle: *mut c_void) {
     // SAFETY: the caller passes null or a handle, which begins with its tag.

@@ -200,8 +200,8 @@ fn answer(
 }
 
 /// Acquires the right to fly consecutive robots, and waits for the burn-in of their worlds. Robots of other clients are
-/// refused with EW_STATUS_BUSY, or taken over if `takeover` is set. The lease ends `seconds_to_live` after its last use;
-/// 0: the server's default. To continue an episode, call ew_observe; to begin one, ew_reset.
+/// refused with EW_STATUS_BUSY, or taken over if `takeover` is set. The lease ends `seconds_to_live` after its last
+/// use; 0: the server's default. To continue an episode, call ew_observe; to begin one, ew_reset.
 #[unsafe(no_mangle)]
 pub extern "C" fn ew_acquire(
     server: *mut Server,
@@ -233,8 +233,8 @@ pub extern "C" fn ew_acquire(
 }
 
 /// Starts a new episode in each world of the lease. `seeds` has one seed per world, or is NULL: then the server derives
-/// them. Waits for the burn-in, which can take a while: use a timeout of minutes. The answer shows the robots' cells and
-/// empty frames. This answer, and those of the functions below, live until the next call with the lease.
+/// them. Waits for the burn-in, which can take a while: use a timeout of minutes. The answer shows the robots' cells
+/// and empty frames. This answer, and those of the functions below, live until the next call with the lease.
 #[unsafe(no_mangle)]
 pub extern "C" fn ew_reset(
     lease: *mut LeaseHandle,
