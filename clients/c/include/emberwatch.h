@@ -12,10 +12,10 @@
 // Rules
 //
 // - Functions that can fail return 0, or a refusal of the server (an ew_status, positive; nothing changed), or a
-//   failure (an ew_failure, negative). They describe it in the ew_error of their last argument. It may be NULL, and so may
-//   every other pointer for a result, except for a new handle.
-// - Handles (ew_server, ew_lease, ew_samples) are freed by ew_free. Nothing else is:
-//   all other pointers that a function returns belong to a handle, and live until the call that the function names.
+//   failure (an ew_failure, negative). They describe it in the ew_error of their last argument. It may be NULL, and so
+//   may every other pointer for a result, except for a new handle.
+// - Handles (ew_server, ew_lease, ew_samples) are freed by ew_free. Nothing else is: all other pointers that a function
+//   returns belong to a handle, and live until the call that the function names.
 // - Threads may share an ew_server; its requests run one after another. Each other handle is for one thread at a time:
 //   a second one gets EW_FAILURE_IN_USE. Threads with a lease each may step at the same time only over connections of
 //   their own (ew_attach each), because a step keeps its connection until the world has moved.
@@ -26,8 +26,8 @@
 //   wait. Observers need nothing: they show the next server.
 // - After a fork, the child must not use the handles of its parent, which answer EW_FAILURE_FORKED: it attaches anew.
 // - One copy of this library per process: a second one (or Python's module emberwatch) gets EW_FAILURE_CHANNEL.
-// - The library installs no signal handlers, prints nothing, and never ends the process. No call may be made from a
-//   signal handler.
+// - The library installs no signal handlers, prints nothing (except at EW_FAILURE_BUG), and never ends the process. No
+//   call may be made from a signal handler.
 // - Structs that the library returns by pointer may get fields at their end in later releases of the same EW_ABI: never
 //   copy them by size. ew_error and ew_intent do not change.
 
