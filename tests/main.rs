@@ -8,6 +8,7 @@
 
 mod agent_beliefs;
 mod autoencoder;
+mod c;
 mod commands;
 mod compare;
 mod compliance;

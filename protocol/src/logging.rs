@@ -23,7 +23,7 @@ const DEFAULT: &str = "info";
 
 /// Our crates, each without the prefix `emberwatch_`.
 const CRATES: &str =
-    "acting agent belief dashboard gradient learning messages model network protocol server sim";
+    "acting agent belief c dashboard gradient learning messages model network protocol server sim";
 
 static WAITING: Mutex<Waiting> = Mutex::new(Waiting {
     text: Vec::new(),

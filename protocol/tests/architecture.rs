@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources. Each folder in them that contains source files is a layer.
-const SOURCES: [&str; 16] = [
+const SOURCES: [&str; 17] = [
     "protocol/src",
     "protocol/messages/src",
     "protocol/model/src",
@@ -20,6 +20,7 @@ const SOURCES: [&str; 16] = [
     "agent/gradient/src",
     "agent/learning/src",
     "agent/network/src",
+    "clients/c/src",
     "clients/dashboard/src",
     "clients/dashboard/page",
     "tests/src",

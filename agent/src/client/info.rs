@@ -5,7 +5,6 @@ use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::client::STEP_TIMEOUT;
 use emberwatch_protocol::connection::{ConnectionError, unexpected};
 use emberwatch_protocol::control::{Reply, Request, ServerInfo};
-use emberwatch_protocol::model::Description;
 use emberwatch_protocol::task::Task;
 use emberwatch_protocol::{Connection, Model};
 use std::time::Duration;
@@ -60,17 +59,13 @@ pub fn is_belief_left(
 /// Returns what the worlds of a server are called. Of a task's worlds, the model's name is known even if the server
 /// hides the model. Recorded worlds are called as their description.
 pub fn world_names(info: &ServerInfo) -> WorldNames {
-    let revealed = match &info.recorded_world {
-        Some(recorded) => recorded.description.as_deref().map(Description::model_of),
-        None => info.model.as_deref().map(Model::from_toml),
-    };
     let task = info
         .task
         .as_deref()
         .filter(|_| info.recorded_world.is_none());
     let task = || task.and_then(|name| Task::named(name).ok());
     let of_task = || task().map(|task| task.world.model);
-    let revealed = revealed.and_then(Result::ok).map(|it| it.name().into());
+    let revealed = info.revealed_model().map(|it| it.name().into());
     WorldNames {
         model: revealed.or_else(|| of_task().filter(|name| Model::built_in(name).is_some())),
         observations: info.observations.clone(),

@@ -5,11 +5,10 @@
 pub mod settings;
 #[cfg(test)]
 mod tests;
-mod waiting;
+mod wait;
 
-pub use waiting::INSTANCE;
+pub use wait::{INSTANCE, wait_for};
 
-use self::waiting::wait_for;
 use crate::config::Checked;
 use crate::limits::{check_memory, n_threads, start};
 use crate::rate::Rate;
@@ -21,16 +20,20 @@ use crate::world::{Episode, Rules};
 use anyhow::Result;
 use emberwatch_messages::backend::{Backend, StepAnswer};
 use emberwatch_messages::control::{Reply, ServerInfo};
-use emberwatch_messages::errors::{ConnectionError, check_status};
+use emberwatch_messages::errors::{ConnectionError, ErrorClass, check_status};
+use emberwatch_messages::limits::memory::NoMemory;
 use emberwatch_messages::limits::threads::NoThreads;
 use emberwatch_messages::message::{Status, StepRequest, VERSION, WorldResult};
 use emberwatch_model::grid::Grid;
 use rayon::{ThreadPool, ThreadPoolBuilder};
+use serde_json::{Map, Value};
+use settings::ReadError;
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
+use thiserror::Error;
 
 /// Maximum number of queued file jobs. Each job keeps a whole snapshot in memory.
 const MAX_FILES: usize = 16;
@@ -56,7 +59,40 @@ pub struct Embedded {
     is_over: bool,
 }
 
+/// The reason why worlds could not be opened.
+#[derive(Debug, Error)]
+pub enum OpenError {
+    /// The settings could not be read.
+    #[error(transparent)]
+    Settings(#[from] ReadError),
+    /// The worlds could not be created.
+    #[error("{0:#}")]
+    Worlds(anyhow::Error),
+}
+
+impl OpenError {
+    /// Returns the class of the error.
+    pub fn class(&self) -> ErrorClass {
+        match self {
+            Self::Settings(ReadError::Wait(error)) => error.class(),
+            Self::Settings(ReadError::Threads(_)) => ErrorClass::Memory,
+            Self::Worlds(error) if error.is::<NoMemory>() || error.is::<NoThreads>() => {
+                ErrorClass::Memory
+            }
+            Self::Settings(ReadError::Config(_)) | Self::Worlds(_) => ErrorClass::Invalid,
+        }
+    }
+}
+
 impl Embedded {
+    /// Reads and checks settings as [`settings::read`] does, and creates the worlds.
+    ///
+    /// # Errors
+    /// As for [`settings::read`] and [`Self::new`].
+    pub fn open(given: Map<String, Value>) -> Result<Self, OpenError> {
+        Self::new(settings::read(given)?).map_err(OpenError::Worlds)
+    }
+
     /// Creates the worlds and starts their burn-ins. Ignores settings about channels and automatic snapshots.
     ///
     /// # Errors

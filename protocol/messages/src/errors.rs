@@ -185,31 +185,33 @@ pub enum ConnectionError {
     },
 }
 
-/// What a caller can do about an error. Clients in other languages have one exception or code for each.
+/// What a caller can do about an error. Clients in other languages have one exception or code for each; the numbers are
+/// the codes of the C interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(i32)]
 pub enum ErrorClass {
-    /// The check set with [`crate::interrupt::interrupt_when`] ended a wait.
-    Interrupted,
     /// An argument is invalid, or the worlds cannot do this.
-    Invalid,
+    Invalid = -1,
     /// No server runs on the instance. Waiting may help.
-    NoServer,
-    /// The server speaks another version of the protocol.
-    OtherVersion,
-    /// The server is in another PID namespace.
-    OtherPidNamespace,
-    /// A channel could not be opened or used.
-    Channel,
-    /// There is too little memory.
-    Memory,
+    NoServer = -2,
     /// The server ended. Connect again.
-    ServerGone,
-    /// No answer came in time.
-    Timeout,
-    /// The server refused the request.
-    Refused,
+    ServerGone = -3,
+    /// No answer or sample came in time.
+    Timeout = -4,
+    /// The check for interrupts ended a wait.
+    Interrupted = -5,
+    /// A channel in shared memory could not be opened or used.
+    Channel = -6,
+    /// There is too little memory, or no thread could be started.
+    Memory = -7,
     /// An answer or a sample is invalid.
-    BadAnswer,
+    BadAnswer = -8,
+    /// The server speaks another version of the protocol.
+    OtherVersion = -9,
+    /// The server is in another PID namespace.
+    OtherPidNamespace = -10,
+    /// The server refused the request.
+    Refused = -11,
 }
 
 impl ConnectionError {
@@ -263,10 +265,8 @@ pub fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // The message names a flag of the agent, the usual caller. Other callers might lack this flag.
                 Status::Busy => format!(
-                    "busy: held by pid {detail}; wait for its release, or take over with the flag \
-                     --takeover of `emberwatch-agent run`"
+                    "busy: held by pid {detail}; wait for its release, or take over (--takeover)"
                 ),
                 _ => message.unwrap_or_else(|| status.explain(detail)),
             };

@@ -1,7 +1,7 @@
 //! The answer to `hello`: a server's settings and airspace.
 
 use emberwatch_model::grid::{Grid, Shape, ShapeError};
-use emberwatch_model::{Airspace, MAX_RADIUS};
+use emberwatch_model::{Airspace, Description, MAX_RADIUS, Model};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -84,6 +84,15 @@ impl ServerInfo {
             Some(info) => info.airspace(shape),
             None => Ok(Airspace::open(shape)),
         }
+    }
+
+    /// Returns the model, or the model of a recorded world's description, if the server reveals a valid one.
+    pub fn revealed_model(&self) -> Option<Model> {
+        let model = match &self.recorded_world {
+            Some(recorded) => Description::model_of(recorded.description.as_deref()?),
+            None => Model::from_toml(self.model.as_deref()?),
+        };
+        model.ok()
     }
 
     /// Returns the number of steps of the shortest episode, or `None` if episodes are never truncated.

@@ -181,7 +181,7 @@ pub struct RobotResult {
     pub row: u32,
     /// The robot's column.
     pub col: u32,
-    /// A [`emberwatch_model::frame::Coverage`].
+    /// What the robot's frame shows: 0 nothing, 1 the path, 2 every cell (see [`emberwatch_model::frame::Coverage`]).
     pub coverage: u32,
     /// Number of moves flown; 0 after a reset, and in a step in which the robot hovered or was late.
     pub n_moves: u32,

@@ -1,7 +1,7 @@
 //! Reading the settings of worlds in this process. Files that could block their reader are read in a thread, so that
 //! the wait can time out or be interrupted.
 
-use super::waiting::wait_for;
+use super::wait::wait_for;
 use crate::config::{Checked, ConfigError, ServerConfig};
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::limits::threads::{NoThreads, spawn};

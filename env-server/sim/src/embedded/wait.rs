@@ -1,4 +1,4 @@
-//! Waits for other threads of this process, which time out and can be interrupted.
+//! Waits for other threads.
 
 use emberwatch_messages::errors::ConnectionError;
 use emberwatch_messages::interrupt::check_interrupt;

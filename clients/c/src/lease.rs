@@ -1,0 +1,321 @@
+//! Leases: the right to fly consecutive robots.
+
+use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
+use crate::handle::{array, duration, give, hold, of};
+use crate::server::{Core, Server};
+use crate::view::{View, keep};
+use emberwatch_messages::backend::StepAnswer;
+use emberwatch_messages::client::STEP_TIMEOUT;
+use emberwatch_messages::control::WorldSeed;
+use emberwatch_messages::errors::{ConnectionError, ErrorClass, garbled};
+use emberwatch_messages::lease::{Call, Claim, Lease};
+use emberwatch_messages::message::{
+    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, WorldResult, worlds_of,
+};
+use emberwatch_messages::payload::split_step_payload;
+use std::ops::Range;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+/// Frames show every cell, if the server's coverage allows it.
+pub const EW_FULL_COVERAGE: u32 = 1;
+
+/// One frame per world, of what all its robots saw, instead of one per robot.
+pub const EW_TEAM_FRAMES: u32 = 2;
+
+/// If a world moved without these paths, returns what it shows now instead of EW_STATUS_LATE.
+pub const EW_ACCEPT_LATE: u32 = 1 << 16;
+
+const _: () = assert!(EW_FULL_COVERAGE == FLAG_FULL_COVERAGE && EW_TEAM_FRAMES == FLAG_TEAM_FRAMES);
+
+/// A lease. One thread at a time may use it; threads may use different leases of one server.
+pub struct LeaseHandle {
+    pub core: Arc<Core>,
+    pub robots: Range<u32>,
+    lease: Lease,
+    /// The last answer, to which C has a pointer.
+    last: Mutex<Option<AnswerView>>,
+}
+
+/// The results of worlds and robots, and the frames.
+#[repr(C)]
+pub struct Answer {
+    /// Number of the first robot.
+    pub first_robot: u32,
+    /// Robots, in the order of their numbers.
+    pub n_robots: u32,
+    /// Number of the first world.
+    pub first_world: u32,
+    /// Worlds of these robots.
+    pub n_worlds: u32,
+    /// Frames: one per robot, or one per world with EW_TEAM_FRAMES.
+    pub n_frames: u32,
+    /// Rows of the grid, H.
+    pub height: u32,
+    /// Columns of the grid, W.
+    pub width: u32,
+    /// Number of the lease, for ew_control.
+    pub lease: u64,
+    /// The result of each world.
+    pub worlds: *const WorldResult,
+    /// The result of each robot.
+    pub robots: *const RobotResult,
+    /// n_frames * H * W bytes: an observation, or 255 where nothing was observed.
+    pub frames: *const u8,
+    /// Steps before this one that were missed, with EW_ACCEPT_LATE; otherwise 0.
+    pub n_skipped: u64,
+    /// Time that the server worked, nanoseconds.
+    pub simulation_nanos: u64,
+}
+
+/// An answer of the server, and the number of steps before it that were missed.
+type Seen = (StepAnswer, u64);
+
+type AnswerView = View<Answer, (Vec<WorldResult>, Vec<RobotResult>, Vec<u8>)>;
+
+impl LeaseHandle {
+    pub fn number(&self) -> u64 {
+        self.lease.number()
+    }
+
+    /// Returns the world of a robot of the lease, and its result in the last answer.
+    pub fn last_result(&self, robot: u32) -> Outcome<(u32, WorldResult)> {
+        if !self.robots.contains(&robot) {
+            let expected = format!("a robot of the lease, {:?}", self.robots);
+            return Err(invalid("robot", expected, robot));
+        }
+        let world = worlds_of(robot, 1, self.core.info.n_robots).start;
+        let index = (world - self.lease.worlds().start) as usize;
+        let last = hold(&self.last)?;
+        let result = last.as_ref().and_then(|answer| answer.owned.0.get(index));
+        let missing = || invalid("belief", "ew_reset, ew_step or ew_observe before", "none");
+        Ok((world, *result.ok_or_else(missing)?))
+    }
+
+    /// Makes the view of an answer, and of the number of steps before it that were missed.
+    fn view(&self, ((reply, payload), n_skipped): Seen) -> Outcome<AnswerView> {
+        let parts = split_step_payload(&reply, &payload)
+            .map_err(|expected| garbled("step", format!("expected {expected} bytes")))?;
+        let view = Answer {
+            first_robot: reply.first_robot,
+            n_robots: reply.n_robots,
+            first_world: self.lease.worlds().start,
+            n_worlds: reply.n_worlds,
+            n_frames: match reply.flags & EW_TEAM_FRAMES {
+                0 => reply.n_robots,
+                _ => reply.n_worlds,
+            },
+            height: reply.height,
+            width: reply.width,
+            lease: self.number(),
+            worlds: parts.worlds.as_ptr(),
+            robots: parts.robots.as_ptr(),
+            frames: parts.frames.as_ptr(),
+            n_skipped,
+            simulation_nanos: reply.simulation_nanos,
+        };
+        let (worlds, robots) = (parts.worlds, parts.robots);
+        Ok(View::new(view, (worlds, robots, payload)))
+    }
+
+    fn send(&self, call: &mut Call<'_>) -> Result<StepAnswer, ConnectionError> {
+        self.core.with(|backend| self.lease.send(backend, call))
+    }
+
+    /// Asks for the results and frames of an earlier step, or for the last ones.
+    fn look(&self, step: Option<u64>, flags: u32, limit: Duration) -> Outcome<Seen> {
+        let operation = step.map_or(Operation::Observe, |_| Operation::Recall);
+        let request = self.lease.request(operation, &self.robots, flags);
+        let steps = step.map_or(Vec::new(), |step| vec![step; self.lease.worlds().len()]);
+        Ok((self.send(&mut Call::of_past(request, steps, limit))?, 0))
+    }
+
+    fn reset(&self, seeds: *const u64, n_seeds: usize, limit: Duration) -> Outcome<Seen> {
+        let start = Instant::now();
+        let worlds = self.lease.worlds();
+        let given = if seeds.is_null() {
+            vec![None; worlds.len()]
+        } else {
+            let seeds = array("seeds", seeds, n_seeds)?;
+            seeds.iter().copied().map(Some).collect()
+        };
+        if given.len() != worlds.len() {
+            let expected = format!("{} seeds", worlds.len());
+            return Err(invalid("seeds", expected, given.len()));
+        }
+        let worlds = worlds.zip(given);
+        let worlds = worlds.map(|(world, seed)| WorldSeed { world, seed });
+        self.core
+            .with(|backend| self.lease.reset(backend, worlds.collect(), limit))?;
+        self.look(
+            None,
+            0,
+            limit.saturating_sub(start.elapsed()).max(STEP_TIMEOUT),
+        )
+    }
+
+    fn fly(&self, moves: *const u8, n: usize, flags: u32, limit: Duration) -> Outcome<Seen> {
+        let start = Instant::now();
+        let n_moves = self.core.info.n_moves;
+        let expected = self.robots.len() * n_moves;
+        if n != expected {
+            let expected = format!("{expected} bytes, {n_moves} moves for each robot");
+            return Err(invalid("paths", expected, n));
+        }
+        let moves = array("paths", moves, n)?;
+        let (accepts_late, flags) = (flags & EW_ACCEPT_LATE != 0, flags & !EW_ACCEPT_LATE);
+        let request = self.lease.request(Operation::Step, &self.robots, flags);
+        let paths = Call::new(request, moves, limit.min(STEP_TIMEOUT));
+        let send = |call: &mut Call<'_>| self.send(call);
+        let is_over = || Ok(start.elapsed() >= limit);
+        let flown = self.lease.send_paths(paths, accepts_late, send, is_over)?;
+        flown.ok_or_else(|| {
+            let text = "the world still waits for other robots' paths; yours were withdrawn";
+            Error::of_class(ErrorClass::Timeout, text)
+        })
+    }
+}
+
+impl Drop for LeaseHandle {
+    /// Releases the robots, so that another client need not wait until the lease expires.
+    fn drop(&mut self) {
+        let limit = Duration::from_secs(1);
+        let _ = self.core.with(|worlds| self.lease.release(worlds, limit));
+    }
+}
+
+/// Asks for an answer and keeps it for C.
+fn answer(
+    lease: *mut LeaseHandle,
+    out: *mut *const Answer,
+    error: *mut ErrorInfo,
+    ask: impl FnOnce(&LeaseHandle) -> Outcome<Seen>,
+) -> i32 {
+    guard(error, || {
+        let lease = of(lease)?;
+        let mut last = hold(&lease.last)?;
+        keep(&mut last, lease.view(ask(lease)?)?, out);
+        Ok(())
+    })
+}
+
+/// Acquires the right to fly consecutive robots, and waits for the burn-in of their worlds. Robots of other clients are
+/// refused with EW_STATUS_BUSY, or taken over if `takeover` is set. The lease ends `seconds_to_live` after its last
+/// use; 0: the server's default. To continue an episode, call ew_observe; to begin one, ew_reset.
+#[unsafe(no_mangle)]
+pub extern "C" fn ew_acquire(
+    server: *mut Server,
+    first_robot: u32,
+    n_robots: u32,
+    takeover: bool,
+    seconds_to_live: f64,
+    timeout: f64,
+    out: *mut *mut LeaseHandle,
+    error: *mut ErrorInfo,
+) -> i32 {
+    guard(error, || {
+        let core = of(server)?.core.clone();
+        let robots = first_robot..first_robot.saturating_add(n_robots);
+        let claim = Claim {
+            robots: robots.clone(),
+            takeover,
+            time_to_live: Some(duration(seconds_to_live)).filter(|life| !life.is_zero()),
+        };
+        let (lease, _) = core.with(|it| Lease::acquire(it, &claim, duration(timeout)))?;
+        let lease = LeaseHandle {
+            core,
+            robots,
+            lease,
+            last: Mutex::default(),
+        };
+        give(lease, out)
+    })
+}
+
+/// Starts a new episode in each world of the lease. `seeds` has one seed per world, or is NULL: then the server derives
+/// them. Waits for the burn-in, which can take a while: use a timeout of minutes. The answer shows the robots' cells
+/// and empty frames. This answer, and those of the functions below, live until the next call with the lease.
+#[unsafe(no_mangle)]
+pub extern "C" fn ew_reset(
+    lease: *mut LeaseHandle,
+    seeds: *const u64,
+    n_seeds: usize,
+    timeout: f64,
+    out: *mut *const Answer,
+    error: *mut ErrorInfo,
+) -> i32 {
+    answer(lease, out, error, |lease| {
+        lease.reset(seeds, n_seeds, duration(timeout))
+    })
+}
+
+/// Flies one path with each robot of the lease. `paths` has `n_moves` moves (ew_move) for each robot, one byte each.
+/// `flags` is a sum of EW_FULL_COVERAGE, EW_TEAM_FRAMES and EW_ACCEPT_LATE, or 0. EW_FAILURE_TIMEOUT tells in its
+/// message whether the paths were withdrawn; if the server did not answer at all, ew_observe shows whether they were
+/// flown.
+#[unsafe(no_mangle)]
+pub extern "C" fn ew_step(
+    lease: *mut LeaseHandle,
+    paths: *const u8,
+    n_bytes: usize,
+    flags: u32,
+    timeout: f64,
+    out: *mut *const Answer,
+    error: *mut ErrorInfo,
+) -> i32 {
+    answer(lease, out, error, |lease| {
+        lease.fly(paths, n_bytes, flags, duration(timeout))
+    })
+}
+
+/// Returns the last results and frames of the lease's robots again. `flags` is EW_TEAM_FRAMES or 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn ew_observe(
+    lease: *mut LeaseHandle,
+    flags: u32,
+    timeout: f64,
+    out: *mut *const Answer,
+    error: *mut ErrorInfo,
+) -> i32 {
+    answer(lease, out, error, |lease| {
+        lease.look(None, flags, duration(timeout))
+    })
+}
+
+/// Returns the results and frames of an earlier step k of the episode. EW_STATUS_NOT_KEPT has the nearest step that the
+/// server keeps as its detail.
+#[unsafe(no_mangle)]
+pub extern "C" fn ew_recall(
+    lease: *mut LeaseHandle,
+    step: u64,
+    flags: u32,
+    timeout: f64,
+    out: *mut *const Answer,
+    error: *mut ErrorInfo,
+) -> i32 {
+    answer(lease, out, error, |lease| {
+        lease.look(Some(step), flags, duration(timeout))
+    })
+}
+
+/// Restarts the time until the lease ends, without flying.
+#[unsafe(no_mangle)]
+pub extern "C" fn ew_renew(lease: *mut LeaseHandle, timeout: f64, error: *mut ErrorInfo) -> i32 {
+    guard(error, || {
+        let lease = of(lease)?;
+        Ok(lease
+            .core
+            .with(|worlds| lease.lease.renew(worlds, duration(timeout)))?)
+    })
+}
+
+/// Returns the robots to the server. The handle must still be freed.
+#[unsafe(no_mangle)]
+pub extern "C" fn ew_release(lease: *mut LeaseHandle, timeout: f64, error: *mut ErrorInfo) -> i32 {
+    guard(error, || {
+        let lease = of(lease)?;
+        Ok(lease
+            .core
+            .with(|worlds| lease.lease.release(worlds, duration(timeout)))?)
+    })
+}
