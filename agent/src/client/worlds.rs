@@ -72,8 +72,8 @@ impl Worlds {
     pub fn states(&mut self, seeds: &[u64], step: u64) -> Result<Option<Vec<Grid<u8>>>> {
         match self {
             Self::Attached { truth, .. } => {
-                let states = |truth: &Box<TruthFeed>| truth.states(0..seeds.len() as u32, seeds, step);
-                truth.as_ref().map(states).transpose()
+                let states = |truth: &TruthFeed| truth.states(0..seeds.len() as u32, seeds, step);
+                truth.as_deref().map(states).transpose()
             }
             Self::Simulated(worlds) => {
                 let episodes = worlds.episodes(0..seeds.len())?;
