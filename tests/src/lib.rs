@@ -5,7 +5,6 @@
 pub mod fuzz;
 pub mod harness;
 pub mod meter;
-pub mod mirror;
 mod programs;
 pub mod report;
 pub mod siege;

@@ -444,3 +444,39 @@ fn a_world_is_reset_only_by_the_holder_of_all_held_robots() {
     assert_eq!(lab.answers(), [(waiting, Status::Resetting, 0)]);
     assert_eq!((lab.world().seed, lab.world().step), (9, 0));
 }
+
+#[test]
+fn a_team_frame_joins_the_frames_of_a_world_s_robots() {
+    let mut lab = Lab::new(Duration::ZERO);
+    let lease = lab.acquire(1, 0, 3, false);
+    assert_eq!(lab.replies(1, lease, (0, 3), 0).0, Status::Ok);
+    let robots = lab.episode().robots();
+    let joined = |cell: usize| {
+        robots
+            .iter()
+            .map(|robot| robot.frame().as_bytes()[cell])
+            .min()
+    };
+    let joined: Vec<u8> = (0..4 * 5).filter_map(joined).collect();
+    let step_1 = 1_u64.to_ne_bytes();
+    for (operation, body) in [
+        (Operation::Observe, &[][..]),
+        (Operation::Recall, &step_1[..]),
+    ] {
+        let request = StepRequest {
+            version: VERSION,
+            operation: operation as u32,
+            first_robot: 1,
+            n_robots: 1,
+            flags: FLAG_TEAM_FRAMES,
+            ..StepRequest::default()
+        };
+        let (client, mut payload) = (client(9), Vec::new());
+        let stepped = (lab.simulator).step(lab.now, client, &request, body, &mut payload);
+        let Stepped::Reply(reply) = stepped else {
+            panic!("expected an answer");
+        };
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        assert_eq!(parts.frames, joined, "{operation:?}");
+    }
+}
