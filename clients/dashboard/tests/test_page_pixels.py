@@ -4,7 +4,6 @@ import tomllib
 from collections.abc import Sequence
 
 import numpy as np
-import pytest
 
 from conftest import ROOT
 from emberwatch import Observer, TruthReader
@@ -135,24 +134,3 @@ def check_panels(look, theme, states, observations, unseen) -> None:
         check_pixels(look, f"panel-belief-{state}", ramp(BELIEF[theme], levels))
     entropy = look.array("entropy").reshape(grid)
     check_pixels(look, "panel-entropy", ramp(ENTROPY[theme], entropy))
-
-
-@pytest.mark.parametrize("stops", [*BELIEF.values(), *ENTROPY.values()])
-def test_ramps_are_perceptually_even(stops):
-    lightness = [oklab_lightness(rgb(stop) / 255) for stop in stops.split()]
-    steps = np.diff(lightness)
-    # The stops' colours are rounded to bytes, and clamped to the screen's gamut.
-    assert np.abs(steps - steps.mean()).max() < 0.1 * abs(steps.mean())
-
-
-def oklab_lightness(color: np.ndarray) -> float:
-    """Returns the OKLab lightness L of an sRGB colour."""
-    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
-    cones = np.array(
-        [
-            [0.4122214708, 0.5363325363, 0.0514459929],
-            [0.2119034982, 0.6806995451, 0.1073969566],
-            [0.0883024619, 0.2817188376, 0.6299787005],
-        ]
-    )
-    return float(np.array([0.2104542553, 0.7936177850, -0.0040720468]) @ np.cbrt(cones @ linear))
