@@ -3,7 +3,6 @@
 use crate::limits::memory::in_words;
 use thiserror::Error;
 
-/// Version of the protocol.
 pub const VERSION: u32 = 3;
 
 /// Flag in [`crate::message::StepRequest::flags`]: observe every cell, not only the path. Allowed only if the server's
@@ -27,13 +26,11 @@ pub enum Operation {
     Recall = 3,
 }
 
-/// The error for a number that is not a [`Status`] or not an [`Operation`].
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("{what}: {value} is not a known code")]
 pub struct UnknownCode {
     /// `status` or `operation`.
     pub what: &'static str,
-    /// The number received.
     pub value: u32,
 }
 
@@ -42,7 +39,6 @@ pub struct UnknownCode {
 #[serde(rename_all = "snake_case")]
 #[repr(u32)]
 pub enum Status {
-    /// Done.
     Ok = 0,
     /// The request's protocol version differs from the server's; detail: the server's version.
     VersionMismatch = 1,
@@ -95,7 +91,6 @@ pub enum Status {
 }
 
 impl Status {
-    /// All statuses, in the order of their codes.
     pub const ALL: [Self; 22] = [
         Self::Ok,
         Self::VersionMismatch,

@@ -40,10 +40,8 @@ headers!(
 
 /// A header of samples that a server or an agent publishes.
 pub trait Published: Header {
-    /// Returns the sender's protocol version.
     fn version(&self) -> u32;
 
-    /// Returns the number of the world.
     fn world(&self) -> u32;
 
     /// Returns the number of earlier samples of the same sender. A gap means lost samples.
@@ -78,7 +76,6 @@ published!(FrameHeader, TruthHeader, AgentHeader);
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct StepRequest {
-    /// [`VERSION`].
     pub version: u32,
     /// An [`Operation`].
     pub operation: u32,
@@ -86,7 +83,6 @@ pub struct StepRequest {
     pub lease: u64,
     /// Chosen by the client, and repeated in the answer.
     pub sequence: u64,
-    /// Number of the first robot.
     pub first_robot: u32,
     /// Number of consecutive robots, at least 1.
     pub n_robots: u32,
@@ -96,7 +92,6 @@ pub struct StepRequest {
     pub flags: u32,
     /// Low half of the id of the client's listener on `wake-client`. If both halves are 0, the server sends no wake-up.
     pub listener_low: u64,
-    /// High half of the listener's id.
     pub listener_high: u64,
 }
 
@@ -106,11 +101,9 @@ pub struct StepRequest {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct StepReply {
-    /// [`VERSION`].
     pub version: u32,
     /// A [`Status`].
     pub status: u32,
-    /// The request's sequence number.
     pub sequence: u64,
     /// Number of the first robot, from the request.
     pub first_robot: u32,
@@ -118,16 +111,12 @@ pub struct StepReply {
     pub n_robots: u32,
     /// Number of worlds of these robots; 0 unless the status is `Ok`.
     pub n_worlds: u32,
-    /// The request's flags.
     pub flags: u32,
-    /// Grid height H.
     pub height: u32,
-    /// Grid width W.
     pub width: u32,
     /// Time in nanoseconds that the server spent on checks, simulation and copying for this request. The wait for other
     /// clients' paths is not included.
     pub simulation_nanos: u64,
-    /// The detail of the status; see [`Status`].
     pub detail: u64,
 }
 
@@ -137,7 +126,6 @@ pub struct StepReply {
 pub struct WorldResult {
     /// Step index k after the step; 0 after a reset.
     pub step: u64,
-    /// Seed of the episode.
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
@@ -177,9 +165,7 @@ pub struct RobotResult {
     pub start_row: u32,
     /// Column where the path began, or where the robot stays.
     pub start_col: u32,
-    /// The robot's row.
     pub row: u32,
-    /// The robot's column.
     pub col: u32,
     /// A [`emberwatch_model::frame::Coverage`].
     pub coverage: u32,
@@ -188,7 +174,6 @@ pub struct RobotResult {
 }
 
 impl RobotResult {
-    /// Returns the robot's cell.
     pub fn cell(&self) -> Cell {
         Cell {
             row: self.row as usize,
@@ -196,7 +181,6 @@ impl RobotResult {
         }
     }
 
-    /// Returns the cell where the path began, or where the robot stays.
     pub fn start(&self) -> Cell {
         Cell {
             row: self.start_row as usize,
@@ -209,15 +193,11 @@ impl RobotResult {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct ControlRequest {
-    /// [`VERSION`].
     pub version: u32,
     /// Reserved; always 0.
     pub reserved: u32,
-    /// Chosen by the client, and repeated in the answer.
     pub sequence: u64,
-    /// Low half of the id of the client's listener on `wake-client`. If both halves are 0, the server sends no wake-up.
     pub listener_low: u64,
-    /// High half of the listener's id.
     pub listener_high: u64,
 }
 
@@ -225,11 +205,8 @@ pub struct ControlRequest {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct ControlReply {
-    /// [`VERSION`].
     pub version: u32,
-    /// A [`Status`].
     pub status: u32,
-    /// The request's sequence number.
     pub sequence: u64,
 }
 
@@ -238,21 +215,15 @@ pub struct ControlReply {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct FrameHeader {
-    /// [`VERSION`].
     pub version: u32,
-    /// The world.
     pub world: u32,
     /// Number of earlier samples on this channel. A gap means lost samples.
     pub sequence: u64,
-    /// Number of the world's first robot.
     pub first_robot: u32,
     /// Number of robots R of the world.
     pub n_robots: u32,
-    /// Grid height H.
     pub height: u32,
-    /// Grid width W.
     pub width: u32,
-    /// The world's result.
     pub result: WorldResult,
 }
 
@@ -260,9 +231,7 @@ pub struct FrameHeader {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct TruthHeader {
-    /// [`VERSION`].
     pub version: u32,
-    /// The world.
     pub world: u32,
     /// Number of earlier samples on this channel. A gap means lost samples.
     pub sequence: u64,
@@ -270,11 +239,8 @@ pub struct TruthHeader {
     pub episode: u64,
     /// Step index k of the state.
     pub step: u64,
-    /// Seed of the episode.
     pub seed: u64,
-    /// Grid height H.
     pub height: u32,
-    /// Grid width W.
     pub width: u32,
 }
 
@@ -283,9 +249,7 @@ pub struct TruthHeader {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct AgentHeader {
-    /// [`VERSION`].
     pub version: u32,
-    /// The world.
     pub world: u32,
     /// Number of earlier samples of this agent. A gap means lost samples.
     pub sequence: u64,
@@ -293,15 +257,10 @@ pub struct AgentHeader {
     pub episode: u64,
     /// Step index k of the state that the belief describes.
     pub step: u64,
-    /// Seed of the episode.
     pub seed: u64,
-    /// Grid height H.
     pub height: u32,
-    /// Grid width W.
     pub width: u32,
-    /// Number of states S of the belief.
     pub n_states: u32,
-    /// The agent's process id.
     pub pid: u32,
     /// Number of the first robot that the agent flies.
     pub first_robot: u32,

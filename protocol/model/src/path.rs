@@ -27,7 +27,6 @@ pub struct Flight {
     /// Row-major indices of the distinct cells flown over, in the order of the first visit. The start cell is among
     /// them only if the path returns to it, or if a move off the grid or into a no-fly cell leaves the robot there.
     pub visited: Vec<usize>,
-    /// The robot's last cell.
     pub end: Cell,
 }
 
@@ -35,14 +34,11 @@ pub struct Flight {
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("move {index} of the path: expected 0 (up), 1 (down), 2 (left) or 3 (right), got {value}")]
 pub struct MoveError {
-    /// Position in the path.
     pub index: usize,
-    /// The byte found there.
     pub value: u8,
 }
 
 impl Move {
-    /// All moves, in the order of their wire values.
     pub const ALL: [Self; 4] = [Self::Up, Self::Down, Self::Left, Self::Right];
 
     /// Returns the cell reached from `cell`. A move off the grid leaves the robot in place.
