@@ -8,19 +8,17 @@
 
 mod agent_beliefs;
 mod autoencoder;
+mod clients;
 mod commands;
 mod compare;
 mod compliance;
 mod crash;
-mod determinism;
-mod episodes;
 mod files;
 mod frames;
 mod handover;
 mod hostile;
 mod kills;
 mod land;
-mod lease;
 mod logging;
 mod places;
 mod python;

@@ -10,7 +10,7 @@ use emberwatch_protocol::model::Description;
 use emberwatch_protocol::{Client, Grid, Shape};
 use ndarray::{Array3, Axis};
 use ndarray_npy::WriteNpyExt;
-use tests::harness::{AGENT, Folder, Paths, SERVER, Server, reset, send_paths};
+use tests::harness::{AGENT, Folder, Paths, SERVER, Server, fly_on, reset, send_paths};
 use tests::meter::memory;
 
 const N_MOVES: usize = 4;
@@ -167,35 +167,24 @@ fn hello_tells_of_the_recorded_world_and_keeps_what_it_shall() {
 #[test]
 fn a_restored_world_goes_on_and_another_states_file_is_refused() {
     let (place, other) = (Place::new(&[9, 12], (4, 4)), Place::new(&[9, 13], (4, 4)));
-    let settings = "--states-symmetries --states-offset 3 --start random --robots 2";
+    let settings = "--states-symmetries --states-offset 3 --start random";
     let server = Server::start(&place.flags(settings));
-    let future = |client: &mut Client, truth: &TruthFeed| -> Vec<_> {
-        let mut paths = Paths::new(5);
-        let mut step = || {
-            let shown = client.step(0..2, &paths.take(N_MOVES, 2)).expect("step");
-            let states = truth.states(0..1, &[21], shown[0].world.step);
-            (shown, states.expect("truth"))
-        };
-        (0..3).map(|_| step()).collect()
+    let future = |server: &Server| {
+        let (mut client, truth) = (server.acquire(0..1), truth_of(server));
+        let seen = fly_on(&mut client, 5, 3);
+        let last = &seen[2].world;
+        let states = truth.states(0..1, &[last.seed], last.step).expect("truth");
+        (seen, states)
     };
-    let (mut client, truth) = (server.acquire(0..2), truth_of(&server));
-    reset(&mut client, 21);
-    future(&mut client, &truth);
+    reset(&mut server.acquire(0..1), 21);
     let folder = Folder::default();
     let file = folder.word("lab.snapshot");
     server.command(&format!("snapshot {file}")).check(0);
-    let went_on = future(&mut client, &truth);
-    let restore = format!("restore {file} --takeover");
-    server.command(&restore).check(0);
-    assert_eq!(future(&mut server.acquire(0..2), &truth), went_on);
-    let again = Server::start(&place.flags(&format!("{settings} --restore {file}")));
-    assert_eq!(future(&mut again.acquire(0..2), &truth_of(&again)), went_on);
+    let settings = format!("{settings} --restore {file}");
+    let again = Server::start(&place.flags(&settings));
+    assert_eq!(future(&again), future(&server));
     let words = "states: expected 2 sequences of CRC-32 ";
-    check(
-        SERVER,
-        &other.flags(&format!("{settings} --restore {file}")),
-        words,
-    );
+    check(SERVER, &other.flags(&settings), words);
 }
 
 #[test]

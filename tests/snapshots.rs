@@ -7,16 +7,16 @@ use emberwatch_protocol::client::Observation;
 use emberwatch_protocol::control::Request;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::observer::Observer;
-use emberwatch_sim::snapshot::{self, Durability, SnapshotWorld, decode, encode};
+use emberwatch_sim::snapshot::{self, Durability};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use std::path::{Path, PathBuf};
 use tests::harness::{
-    ENDLESS, Folder, PATIENCE, Paths, SERVER, SMALL, Server, fly_on, frames_until, new_instance,
-    reset, send_paths, small_spec,
+    Folder, PATIENCE, Paths, SERVER, SMALL, Server, fly_on, frames_until, new_instance, reset,
+    send_paths,
 };
-use tests::wire::{RawClient, Wire, control_header};
+use tests::wire::{RawClient, Wire};
 
 const N_MOVES: usize = 6;
 
@@ -356,36 +356,4 @@ fn snapshots_that_cannot_be_written_are_warned_of_now_and_then() {
     server.program.wait_for_words("no snapshot was written");
     let log = server.program.stderr();
     assert!(log.matches("no snapshot was written").count() < 30, "{log}");
-}
-
-#[test]
-fn a_world_in_its_burn_in_begins_again_after_a_restart() {
-    let folder = Folder::default();
-    let flags = format!("--snapshot-every 10 --snapshot-dir {}", folder.word(""));
-    let server = Server::start_with_endless_resets(&flags);
-    let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1..2).lease;
-    let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1,"seed":77}}]}}"#);
-    let pending = wire.send_control(control_header(1), reset.as_bytes());
-    server.program.until(|| server.status().worlds[1].resetting);
-    fly_on(&mut server.acquire(0..1), 0, 20);
-    server.program.until(|| !snapshots_in(&folder).is_empty());
-    server.kill();
-    drop(pending);
-    // Writes the snapshot's worlds to a new snapshot with the settings of a server with a short burn-in.
-    let bytes = std::fs::read(&snapshots_in(&folder)[0]).expect("the snapshot");
-    let restored = decode(&bytes).and_then(|file| file.restore(&small_spec(ENDLESS)));
-    let restored = restored.expect("of that server");
-    let worlds = restored.iter().map(|world| match world {
-        SnapshotWorld::Ready(episode) => SnapshotWorld::Ready(&**episode),
-        SnapshotWorld::New(new) => SnapshotWorld::New(*new),
-    });
-    let bytes = encode(&small_spec(20).settings, &worlds.collect::<Vec<_>>()).expect("small");
-    let copy = folder.write("copy", bytes);
-    let worlds = Server::start(&format!("{SMALL} --worlds 2 --restore {copy}"))
-        .status()
-        .worlds;
-    assert!((10..=20).contains(&worlds[0].info.step), "{worlds:?}");
-    let begun = &worlds[1].info;
-    assert_eq!((begun.seed, begun.episode, begun.step), (77, 1, 0));
 }

@@ -1,10 +1,10 @@
-//! Tests of tasks: a task has the same worlds as the equivalent flags, and `hello`, `status` and snapshots name it.
+//! Tests of tasks: `hello`, `status` and snapshots name them, and commands take worlds, steps and seeds from them.
 
 use crate::commands::{agent, check, check_table};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_protocol::task::Task;
 use emberwatch_sim::snapshot::decode;
-use tests::harness::{AGENT, Folder, SERVER, Server, fly_on, repository, reset};
+use tests::harness::{AGENT, Folder, SERVER, Server, repository};
 
 /// The settings of the task `small` as flags.
 const SMALL_BY_HAND: &str =
@@ -15,20 +15,6 @@ fn mine(task: &str) -> String {
     let text = std::fs::read_to_string(repository().join(format!("config/tasks/{task}.toml")));
     let text = text.expect("the task");
     text.replace(&format!("name = \"{task}\""), "name = \"mine\"")
-}
-
-#[test]
-fn a_task_has_the_worlds_of_its_flags() {
-    let seen = |flags: &str| {
-        let server = Server::start(flags);
-        let mut client = server.acquire(0..1);
-        reset(&mut client, 7);
-        (fly_on(&mut client, 1, 20), server.info().max_steps)
-    };
-    let by_name = seen("--task small");
-    let file = repository().join("config/tasks/small.toml");
-    assert_eq!(by_name, seen(&format!("--task {}", file.display())));
-    assert_eq!(by_name, seen(SMALL_BY_HAND));
 }
 
 #[test]
