@@ -57,10 +57,6 @@ pub struct Embedded {
 }
 
 impl Embedded {
-    /// Creates the worlds and starts their burn-ins. Ignores settings about channels and automatic snapshots.
-    ///
-    /// # Errors
-    /// If the model does not fit the grid, there is too little memory, or no threads can be started.
     pub fn new(checked: Checked) -> Result<Self> {
         let config = &checked.config;
         let n_threads = n_threads(config).min(config.worlds as usize);
@@ -110,10 +106,6 @@ impl Embedded {
         }))
     }
 
-    /// Returns the range of all worlds. `what` names the request in errors.
-    ///
-    /// # Errors
-    /// If the worlds were shut down, or one of them is being reset.
     fn ready_worlds(&mut self, what: &'static str) -> Result<Range<usize>, ConnectionError> {
         let worlds = self.simulator.worlds();
         match self.episodes(worlds.clone())? {
@@ -153,7 +145,6 @@ impl Embedded {
         }
     }
 
-    /// Waits until the worlds of a pending reply are ready.
     fn reset(
         &mut self,
         pending: &PendingReply,

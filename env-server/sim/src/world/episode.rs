@@ -15,7 +15,6 @@ use super::sensor::Sensor;
 use emberwatch_model::path::path_from_bytes;
 use emberwatch_model::{Coverage, Frame, Grid};
 
-/// The current episode of one world.
 #[derive(Debug, Clone)]
 pub struct Episode {
     world: World,
@@ -30,12 +29,10 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// Creates a world at k = 0, in its first episode.
     pub fn new(rules: &Rules, seed: u64) -> Self {
         Self::numbered(rules, seed, 0)
     }
 
-    /// Creates a world at k = 0, in the episode with this number.
     pub fn numbered(rules: &Rules, seed: u64, episode: u64) -> Self {
         let world = World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended);
         Self::beginning(rules, world, episode)
@@ -81,12 +78,10 @@ impl Episode {
         self.history.push(&self.outcome, &self.robots);
     }
 
-    /// Returns the world's outcome of the last step or reset.
     pub fn outcome(&self) -> &WorldOutcome {
         &self.outcome
     }
 
-    /// Returns the robots, in order.
     pub fn robots(&self) -> &[Robot] {
         &self.robots
     }
@@ -103,7 +98,6 @@ impl Episode {
         self.history.step(step).ok_or(nearest)
     }
 
-    /// Estimates the size of this episode in a snapshot, in bytes.
     pub fn n_bytes(&self) -> usize {
         let of_robot = |robot: &Robot| robot.frame.as_bytes().len() + robot.path.len() + 128;
         let robots: usize = self.robots.iter().map(of_robot).sum();
@@ -115,7 +109,6 @@ impl Episode {
         self.world.states()
     }
 
-    /// Returns whether the episode was truncated and cannot step before a reset.
     pub fn is_over(&self) -> bool {
         self.outcome.is_truncated
     }
@@ -125,7 +118,6 @@ impl Episode {
         self.beginning.states()
     }
 
-    /// Returns the steps in the history, from the oldest to the current one.
     pub fn history(&self) -> impl ExactSizeIterator<Item = &PastStep> {
         self.history.all()
     }

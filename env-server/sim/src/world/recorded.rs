@@ -6,7 +6,6 @@ use emberwatch_model::{Grid, Shape};
 use ndarray::{Array3, ArrayView2, Axis};
 use rand::RngExt;
 
-/// The recorded sequences that the worlds of a server show.
 #[derive(Debug)]
 pub struct Recorded {
     /// Each has shape `[K, H, W]`, row-major, with K at least 2.
@@ -17,7 +16,6 @@ pub struct Recorded {
     most_offset: u64,
 }
 
-/// What a seed selects from the recorded states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Choice {
     sequence: usize,
@@ -56,12 +54,10 @@ impl Recorded {
             .ok_or(possible)
     }
 
-    /// Returns the number of sequences.
     pub fn n_sequences(&self) -> usize {
         self.sequences.len()
     }
 
-    /// Returns the number of steps of the shortest possible episode.
     pub fn n_steps(&self) -> u64 {
         self.shortest() - 1 - self.most_offset
     }
@@ -82,9 +78,6 @@ impl Recorded {
     }
 
     /// Writes [`Self::states`] into an existing grid.
-    ///
-    /// # Panics
-    /// If the episode ends before the step.
     pub(super) fn show(&self, seed: u64, step: u64, states: &mut Grid<u8>) {
         let choice = self.choice(seed);
         let recorded = self.sequences[choice.sequence].view();
