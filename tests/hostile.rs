@@ -71,29 +71,6 @@ fn requests_whose_answers_nobody_reads_disturb_nobody() {
 }
 
 #[test]
-fn clients_that_come_and_go_disturb_nobody() {
-    let server = Server::start(FLAGS);
-    let mut bystander = server.acquire(0..1);
-    for round in 1..=60 {
-        let wire = Wire::open(&server.instance);
-        let step = wire
-            .send_step(step_header(round, 6), &body(0))
-            .expect("send");
-        let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
-        match round % 3 {
-            0 => drop((wire, step, control)),
-            1 => drop((step, wire, control)),
-            _ => drop((answer(&step, PATIENCE), control, wire)),
-        }
-        assert_eq!(
-            send_paths(&mut bystander, Paths::new(0).next(6)).world.step,
-            round
-        );
-    }
-    server.acquire(1..3);
-}
-
-#[test]
 fn abandoned_requests_during_a_reset_leak_nothing() {
     let server = Server::start_with_endless_resets("");
     let mut bystander = server.acquire(0..1);

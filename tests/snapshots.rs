@@ -8,9 +8,6 @@ use emberwatch_protocol::control::Request;
 use emberwatch_protocol::message::Status;
 use emberwatch_protocol::observer::Observer;
 use emberwatch_sim::snapshot::{self, Durability};
-use rand::RngExt;
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
 use std::path::{Path, PathBuf};
 use tests::harness::{
     Folder, PATIENCE, Paths, SERVER, SMALL, Server, fly_on, frames_until, new_instance, reset,
@@ -45,36 +42,6 @@ fn snapshots_in(folder: &Folder) -> Vec<PathBuf> {
     paths.retain(|path| path.extension() == Some("snapshot".as_ref()));
     paths.sort();
     paths
-}
-
-#[test]
-fn a_restored_world_and_its_memory_continue_bit_for_bit() {
-    let folder = Folder::default();
-    let file = folder.word("lab.snapshot");
-    let server = Server::start(&format!("{SMALL} --worlds 2 --seed 5 --start random"));
-    let mut client = server.acquire(0..2);
-    reset(&mut client, 70);
-    future(&mut client, 1);
-    let before = client.observe(0..2).expect("observe");
-    let past = client.recall(0..2, 1).expect("recall");
-    server.command(&format!("snapshot {file}")).check(0);
-    let went_on = future(&mut client, 2);
-    let busy = format!("busy: held by pid {}", std::process::id());
-    refused(&server, &format!("restore {file}"), &busy);
-    let restore = format!("restore {file} --takeover");
-    server.command(&restore).check(0);
-    let again = |server: &Server| {
-        let mut client = server.acquire(0..2);
-        assert_eq!(client.observe(0..2).expect("observe"), before);
-        assert_eq!(client.recall(0..2, 1).expect("recall"), past);
-        assert_eq!(future(&mut client, 2), went_on);
-        // A reset to the seed of the first episode repeats that episode.
-        reset(&mut client, 70);
-        client.observe(0..2).expect("observe")
-    };
-    let reset_here = again(&server);
-    let flags = format!("{SMALL} --worlds 2 --seed 9 --start random --restore {file}");
-    assert_eq!(again(&Server::start(&flags)), reset_here);
 }
 
 #[test]
@@ -241,33 +208,6 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
     let server = Server::start_on(&instance, &flags);
     assert_eq!(server.step_of(0), stands, "{}", server.program.stderr());
     server.program.wait_for_words("another kind of file");
-}
-
-#[test]
-#[ignore = "takes minutes"]
-fn servers_killed_at_any_moment_come_back_to_a_step_that_was() {
-    let folder = Folder::default();
-    let place = folder.word("");
-    let flags = format!("--snapshot-every 10 --snapshot-dir {place} --restore {place}");
-    let (instance, undisturbed) = (new_instance(), Server::start(SMALL));
-    let mut undisturbed = undisturbed.acquire(0..1);
-    let path = |k: usize| Paths::new(k as u64).next(N_MOVES);
-    let mut rng = ChaCha8Rng::seed_from_u64(0);
-    let mut expected = vec![undisturbed.observe(0..1).expect("observe").remove(0)];
-    for _ in 0..80 {
-        let server = Server::start_on(&instance, &format!("{SMALL} {flags}"));
-        let mut client = server.take_over(0..1);
-        let mut seen = client.observe(0..1).expect("observe").remove(0);
-        for _ in 0..rng.random_range(1..200) {
-            let k = seen.world.step as usize;
-            assert_eq!(expected.get(k), Some(&seen), "step {k}");
-            seen = send_paths(&mut client, path(k));
-            if expected.len() == k + 1 {
-                expected.push(send_paths(&mut undisturbed, path(k)));
-            }
-        }
-        server.kill();
-    }
 }
 
 #[test]

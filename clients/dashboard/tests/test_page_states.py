@@ -2,7 +2,7 @@
 
 import os
 
-from running import FAST, eventually, unused_instance
+from running import eventually, unused_instance
 
 
 def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
@@ -84,21 +84,6 @@ def test_keys_pause_and_scrub_from_anywhere(watched, programs):
     programs.agent(watched.server.instance)
     look.at("pause").click()
     look.wait_for_steps()
-
-
-def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
-    # The agent makes thousands of steps per second, because paths in a small world cost little.
-    server = programs.server(height=4, width=4, moves=2, burn_in=0)
-    look = open_page(programs.dashboard(server.instance))
-    programs.agent(server.instance, policy="random_walk", steps_per_second=FAST)
-    look.wait_for_steps()
-    look.page.keyboard.press("Space")
-    # `settled_serial` would not return: when the oldest entry is shown, its serial keeps changing.
-    at = look.picture(".shown.serial")
-    look.eventually(lambda: look.picture(".kept.first") > at, "it fell out of what is kept")
-    look.eventually(lambda: look.page.get_by_text("is no longer").is_visible(), "said so")
-    oldest = "emberwatch.picture.shown.serial - emberwatch.picture.kept.first"
-    assert look.page.evaluate(oldest) == 0, "the oldest is shown"
 
 
 def test_a_server_that_is_killed_is_waited_for_whatever_its_grid(watched, programs):

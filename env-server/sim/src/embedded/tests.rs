@@ -69,6 +69,7 @@ fn a_client_flies_resets_and_recalls() {
     }
     assert_eq!(client.observe(0..2).expect("worlds"), second);
     assert_eq!(client.recall(0..2, 1).expect("kept"), first);
+    assert_eq!(status(client.recall(0..2, 3)), Status::NotKept);
     client.reset(&reset(1, 5)).expect("a world");
     let seen = step(&mut client).expect("a step");
     assert_eq!([0, 1].map(|robot: usize| seen[robot].world.step), [3, 1]);
@@ -173,6 +174,8 @@ fn a_restored_snapshot_continues_in_the_same_way() {
         .backend()
         .control(&request(save), LONG)
         .expect("a file");
+    let present = client.observe(0..2).expect("worlds");
+    let past = client.recall(0..2, 0).expect("kept");
     let future = step(&mut client).expect("a step");
     let lease = client.lease();
     let load = request(
@@ -180,7 +183,8 @@ fn a_restored_snapshot_continues_in_the_same_way() {
         "from": 0, "path": path}),
     );
     client.backend().control(&load, LONG).expect("worlds");
-    client.observe(0..2).expect("worlds");
+    assert_eq!(client.observe(0..2).expect("worlds"), present);
+    assert_eq!(client.recall(0..2, 0).expect("kept"), past);
     assert_eq!(step(&mut client).expect("a step"), future);
 }
 

@@ -124,7 +124,10 @@ fn turned(states: ArrayView2<'_, u8>, symmetry: u64) -> ArrayView2<'_, u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::array;
+    use crate::world::hidden::{Source, World};
+    use ndarray::{Axis, array};
+    use std::sync::Arc;
+    use std::sync::atomic::AtomicBool;
 
     fn recorded(lengths: &[usize], (height, width): (usize, usize), symmetries: bool) -> Recorded {
         let sequence = |(index, &length): (usize, &usize)| {
@@ -169,6 +172,19 @@ mod tests {
                 assert_eq!(recorded.last_step(seed), 1 + seed % 2);
             }
         }
+    }
+
+    #[test]
+    fn a_world_shows_its_sequence_to_the_end() {
+        let recorded = Arc::new(recorded(&[4, 5], (1, 3), false));
+        let source = Source::Recorded(Arc::clone(&recorded));
+        let mut world = World::new(source, 7, 0, &AtomicBool::new(false));
+        for k in 0..4 {
+            let expected = recorded.sequences[1].index_axis(Axis(0), k);
+            assert_eq!(world.states(), expected);
+            world.advance();
+        }
+        assert_eq!(world.step(), recorded.last_step(7));
     }
 
     #[test]
