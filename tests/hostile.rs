@@ -9,9 +9,9 @@ use emberwatch_protocol::message::{Status, StepRequest};
 use emberwatch_protocol::observer::Observer;
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use std::time::Duration;
-use tests::harness::{PATIENCE, Paths, Server, eventually, send_paths};
+use tests::harness::{Paths, Server, eventually, send_paths};
 use tests::siege::{FLAGS, besiege};
-use tests::wire::{RawClient, Wire, answer, client, control_header, step_body, step_header};
+use tests::wire::{RawClient, Wire, client, control_header, step_body, step_header};
 
 #[test]
 fn a_server_recovers_when_it_has_descriptors_again() {

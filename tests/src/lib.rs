@@ -8,5 +8,4 @@ pub mod meter;
 mod programs;
 pub mod report;
 pub mod siege;
-pub mod stepper;
 pub mod wire;

@@ -1,4 +1,4 @@
-//! Statistics that benchmarks and long runs print.
+//! Statistics that benchmarks print.
 
 use std::io::Write;
 
