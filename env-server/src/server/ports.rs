@@ -102,9 +102,10 @@ impl Ports {
         let frame_service = services.frames()?;
         let frames = publisher(&frame_service, config.frame_bytes, &failed)?;
         let truth_service = config.publish_truth.then(|| services.truth()).transpose()?;
-        let truth = truth_service.as_ref();
-        let truth = truth.map(|service| publisher(service, config.n_cells, &failed));
-        let truth = truth.transpose()?;
+        let truth = truth_service
+            .as_ref()
+            .map(|service| publisher(service, config.n_cells, &failed))
+            .transpose()?;
         let listener = services.listener(Channel::WakeServer)?;
         let answers = Answers::new(&services)?;
         fill_ports(&node, false)?;

@@ -128,8 +128,9 @@ impl AirspaceInfo {
                 "airspace: expected a radius up to {MAX_RADIUS}, got {radius}"
             ));
         }
-        let no_fly = self.no_fly.as_ref();
-        let no_fly = no_fly
+        let no_fly = self
+            .no_fly
+            .as_ref()
             .map(|rows| of_grid("no_fly", shape, rows))
             .transpose()?;
         let no_fly = no_fly.map(|map| Arc::new(map.mapv(|flag| flag != 0)));

@@ -167,15 +167,12 @@ impl Services<'_> {
     }
 
     pub fn wake(&self, channel: Channel) -> Result<WakeService, ChannelError> {
-        let builder = self
-            .node
+        self.node
             .service_builder(&service_name(self.instance, channel))
-            .event();
-        let builder = builder
+            .event()
             .max_listeners(MAX_NODES)
             .max_notifiers(MAX_NODES)
-            .max_nodes(MAX_NODES);
-        builder
+            .max_nodes(MAX_NODES)
             .open_or_create()
             .map_err(ipc_error("open a wake channel"))
     }
@@ -198,39 +195,33 @@ impl Services<'_> {
         n_readers: usize,
         buffer: usize,
     ) -> Result<Publications<H>, PublishSubscribeOpenOrCreateError> {
-        let name = service_name(self.instance, channel);
-        let builder = self.node.service_builder(&name);
-        let builder = builder
+        self.node
+            .service_builder(&service_name(self.instance, channel))
             .publish_subscribe::<[u8]>()
-            .user_header::<WireHeader<H>>();
-        let builder = builder
+            .user_header::<WireHeader<H>>()
             .max_publishers(n_publishers)
             .max_subscribers(n_readers)
-            .max_nodes(MAX_NODES);
-        let builder = builder.history_size(1).subscriber_max_buffer_size(buffer);
-        let builder = builder
+            .max_nodes(MAX_NODES)
+            .history_size(1)
+            .subscriber_max_buffer_size(buffer)
             .subscriber_max_borrowed_samples(1)
-            .enable_safe_overflow(true);
-        builder.open_or_create()
+            .enable_safe_overflow(true)
+            .open_or_create()
     }
 
     fn create<Q: Header, R: Header>(
         &self,
         channel: Channel,
     ) -> Result<RequestResponse<Q, R>, ChannelError> {
-        let builder = self
-            .builder::<Q, R>(channel)
+        self.builder::<Q, R>(channel)
             .max_servers(1)
             .max_clients(MAX_CLIENTS)
-            .max_nodes(MAX_NODES);
-        let builder = builder
+            .max_nodes(MAX_NODES)
             .max_active_requests_per_client(1)
-            .max_loaned_requests(1);
-        let builder = builder
+            .max_loaned_requests(1)
             .max_response_buffer_size(1)
-            .max_borrowed_responses_per_pending_response(1);
-        let builder = builder.enable_fire_and_forget_requests(false);
-        builder
+            .max_borrowed_responses_per_pending_response(1)
+            .enable_fire_and_forget_requests(false)
             .open_or_create()
             .map_err(ipc_error("create a request channel"))
     }
@@ -257,11 +248,9 @@ impl Services<'_> {
         &self,
         channel: Channel,
     ) -> request_response_builder::Builder<[u8], WireHeader<Q>, [u8], WireHeader<R>, Ipc> {
-        let builder = self
-            .node
-            .service_builder(&service_name(self.instance, channel));
-        let builder = builder.request_response::<[u8], [u8]>();
-        builder
+        self.node
+            .service_builder(&service_name(self.instance, channel))
+            .request_response::<[u8], [u8]>()
             .request_user_header::<WireHeader<Q>>()
             .response_user_header::<WireHeader<R>>()
     }
