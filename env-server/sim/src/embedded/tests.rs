@@ -1,7 +1,7 @@
 use super::*;
 use crate::config::ServerConfig;
 use emberwatch_messages::client::{Claim, Client, Observation};
-use emberwatch_messages::control::{Request, WorldInfo, WorldSeed};
+use emberwatch_messages::control::{CoverageRule, Request, WorldInfo, WorldSeed};
 use emberwatch_model::path::Move;
 use emberwatch_model::settings::WorldSettings;
 use emberwatch_model::{Coverage, UNOBSERVED};
@@ -90,6 +90,7 @@ fn a_world_does_not_depend_on_worlds_next_to_it_or_on_threads() {
             worlds,
             threads,
             seed,
+            coverage: CoverageRule::Full,
             world,
             ..ServerConfig::default()
         })
