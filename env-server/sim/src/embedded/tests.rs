@@ -114,7 +114,7 @@ fn a_reset_begins_an_episode_with_an_empty_frame_and_a_seed() {
     let mut client = client(3, 20);
     step(&mut client).expect("a step");
     let seeds = [(2, 0), (0, u64::MAX)];
-    let begun = client.reset(&seeds.map(|(world, seed)| reset(world, seed)[0].clone()));
+    let begun = client.reset(&seeds.map(|(world, seed)| reset(world, seed)[0]));
     let expected = seeds.map(|(world, seed)| WorldInfo {
         world,
         step: 0,
