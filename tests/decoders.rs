@@ -10,7 +10,6 @@ use proptest::sample::select;
 use proptest::test_runner::{Config, FileFailurePersistence, TestCaseError, TestRng, TestRunner};
 use rustix::time::{ClockId, Timespec, clock_gettime};
 use std::cell::Cell;
-use std::ops::Range;
 use tests::fuzz::{TARGETS, Target};
 use tests::meter::memory;
 
@@ -32,64 +31,40 @@ const INTEGERS: [u64; 9] =
 const WORDS: &str = r#"0 1 -1 -0.0 255 65536 4294967296 9007199254740993 9223372036854775807 18446744073709551615 1e400
     1e-400 1e308 1e100 1e30 1e-30 1e-320 nan -inf inf null true " \u0000 \ud800 """ { } [ ] [[ = , é"#;
 
-/// A change to a file. Its position is any integer, taken modulo the number of positions in the file.
+/// Replaces a range of bytes with other bytes. The position is any integer, taken modulo the length of the file.
 #[derive(Debug, Clone)]
-enum Change {
-    /// Replaces a range of bytes with other bytes.
-    Splice(usize, usize, Vec<u8>),
-    /// Writes an integer of 1, 2, 4 or 8 bytes at an offset that is a multiple of its length.
-    Overwrite(usize, Vec<u8>),
-    /// Replaces the next number in a text.
-    Number(usize, Vec<u8>),
+struct Change {
+    at: usize,
+    n_removed: usize,
+    inserted: Vec<u8>,
 }
 
 fn change(files: Vec<Vec<u8>>) -> impl Strategy<Value = Change> + Clone {
     let words: Vec<&str> = WORDS.split_whitespace().collect();
-    let word = move || select(words.clone()).prop_map(|word| word.as_bytes().to_vec());
+    let word = select(words).prop_map(|word| word.as_bytes().to_vec());
     let part = (select(files), any::<usize>(), 1..64_usize).prop_map(|(file, at, length)| {
         let at = at % (file.len() + 1);
         file[at..file.len().min(at + length)].to_vec()
     });
-    let removed = prop_oneof![4 => Just(0_usize), 8 => 0..9_usize, 1 => 9..MAX_BYTES];
-    let inserted = prop_oneof![4 => vec(any::<u8>(), 0..9), 2 => word(), 1 => part];
     let integer = (select(&INTEGERS), 0..3_u64, 0..4_u32).prop_map(|(number, more, power)| {
         number.wrapping_add(more).to_ne_bytes()[..1 << power].to_vec()
     });
-    prop_oneof![
-        5 => (any::<usize>(), removed, inserted).prop_map(|(at, removed, inserted)| {
-            Change::Splice(at, removed, inserted)
-        }),
-        3 => (any::<usize>(), integer).prop_map(|(at, integer)| Change::Overwrite(at, integer)),
-        2 => (any::<usize>(), word()).prop_map(|(at, word)| Change::Number(at, word)),
-    ]
+    let inserted = prop_oneof![4 => vec(any::<u8>(), 0..9), 3 => word, 1 => part];
+    let n_removed = prop_oneof![4 => Just(0_usize), 8 => 0..9_usize, 1 => 9..MAX_BYTES];
+    let overwritten = integer.prop_map(|inserted| (inserted.len(), inserted));
+    let replaced = prop_oneof![3 => (n_removed, inserted), 2 => overwritten];
+    (any::<usize>(), replaced).prop_map(|(at, (n_removed, inserted))| Change {
+        at,
+        n_removed,
+        inserted,
+    })
 }
 
 fn apply(change: &Change, bytes: &mut Vec<u8>) {
-    let length = bytes.len();
-    match change {
-        Change::Splice(at, removed, inserted) => {
-            let at = at % (length + 1);
-            bytes.splice(at..length.min(at + removed), inserted.iter().copied());
-        }
-        Change::Overwrite(at, integer) => {
-            let at = at % (length + 1) / integer.len() * integer.len();
-            let end = length.min(at + integer.len());
-            bytes[at..end].copy_from_slice(&integer[..end - at]);
-        }
-        Change::Number(at, word) => {
-            bytes.splice(number_after(bytes, at % (length + 1)), word.iter().copied());
-        }
-    }
+    let at = change.at % (bytes.len() + 1);
+    let end = bytes.len().min(at + change.n_removed);
+    bytes.splice(at..end, change.inserted.iter().copied());
     bytes.truncate(MAX_BYTES);
-}
-
-/// Returns the range of the first run of digits and points after a position.
-fn number_after(bytes: &[u8], at: usize) -> Range<usize> {
-    let is_number = |byte: &u8| byte.is_ascii_digit() || *byte == b'.';
-    let begin = bytes[at..].iter().position(is_number);
-    let start = begin.map_or(bytes.len(), |begin| at + begin);
-    let length = bytes[start..].iter().position(|byte| !is_number(byte));
-    start..length.map_or(bytes.len(), |length| start + length)
 }
 
 /// Decodes one input and returns whether the decoder accepted it.

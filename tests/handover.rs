@@ -6,10 +6,8 @@ use emberwatch_protocol::control::{LeftPart, Reply, Request};
 use emberwatch_protocol::message::{FrameHeader, Status};
 use emberwatch_protocol::observer::Observer;
 use emberwatch_protocol::{Client, Model, Move};
-use tests::harness::{
-    PATIENCE, Paths, Program, SMALL, Server, frames_until, path_of, seed, send_paths,
-};
-use tests::wire::{RawClient, Wire, recall_header, step_body};
+use tests::harness::{PATIENCE, Paths, Program, SMALL, Server, frames_until, path_of, send_paths};
+use tests::wire::{RawClient, Wire};
 
 /// A world with many fires.
 const FLAGS: &str =
@@ -109,32 +107,6 @@ fn an_agent_that_finds_only_some_frames_makes_do_with_them() {
     run(&forgetful, walk).ends(0);
     let ended = run(&forgetful, "--steps 2").ends(0);
     assert!(!ended.stderr.contains("the belief was"), "{}", ended.stderr);
-}
-
-#[test]
-fn kept_frames_are_those_that_were_answered() {
-    let server = Server::start(&format!("{SMALL} --worlds 2 --history 4"));
-    let mut client = server.acquire(0..2);
-    let mut paths = Paths::new(0);
-    let mut step = || client.step(0..2, &paths.take(6, 2)).expect("step");
-    let seen: Vec<_> = (0..6).map(|_| step()).collect();
-    for step in 3..=6 {
-        let kept = client.recall(0..2, step).expect("recall");
-        assert_eq!(kept, seen[step as usize - 1]);
-    }
-    let wire = Wire::open(&server.instance);
-    let check = |step, n_robots, expected: (Status, u64)| {
-        let body = step_body(&vec![step; n_robots as usize], &[]);
-        let got = wire.status_of(recall_header(0..n_robots), &body);
-        assert_eq!(got, expected, "{n_robots} robots at step {step}");
-    };
-    for (step, nearest) in [(2, 3), (7, 6), (u64::MAX, 6)] {
-        check(step, 2, (Status::NotKept, nearest));
-    }
-    check(3, 3, (Status::NoSuchRobot, 2));
-    client.reset(&[seed(1, 8)]).expect("reset");
-    check(3, 2, (Status::NotKept, 0));
-    check(6, 1, (Status::Ok, 0));
 }
 
 #[test]

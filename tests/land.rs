@@ -1,15 +1,12 @@
-//! Tests of maps, no-fly cells and a wide sensor on a running server. The expected observations and rewards are
-//! derived only from the paths, the hidden states and the reply to `hello`.
+//! Tests of maps, no-fly cells and a wide sensor on a running server.
 
 use crate::commands::{agent, check};
 use crate::trainings::on;
-use emberwatch_protocol::observer::Observer;
-use emberwatch_protocol::{Client, Model, UNOBSERVED};
+use emberwatch_protocol::Model;
 use ndarray::Array2;
 use ndarray_npy::NpzWriter;
-use std::collections::BTreeSet;
 use std::io::Cursor;
-use tests::harness::{Folder, PATIENCE, Paths, SERVER, Server, reset, run};
+use tests::harness::{Folder, SERVER, Server, run};
 
 const N_MOVES: usize = 6;
 
@@ -45,81 +42,18 @@ fn flags(model: &str) -> String {
 }
 
 #[test]
-fn robots_see_and_earn_what_hello_and_the_hidden_states_say() {
-    let folder = Folder::default();
-    let server = Server::start(&flags(&write_model(&folder, 2)));
-    let info = server.info();
-    let airspace = info.airspace().expect("an airspace");
-    assert_eq!((airspace.radius(), info.n_observations), (2, 3));
-    let model = info.model.as_ref().expect("a model");
-    let model = Model::from_toml(model).expect("a model with its map");
-    let hazards = model.hazards().expect("hazards");
-    assert_eq!(hazards.maps()["fuel"].shape(), [7, 9]);
-    let truth = Observer::truth(&server.instance).expect("truth");
-    let mut client = server.acquire(0..2);
-    reset(&mut client, 1000);
-    let (mut paths, mut total) = (Paths::new(3), 0.0);
-    // The number of cells observed next to the paths, how many of these were observed correctly, and the expected number.
-    let (mut n_seen, mut n_right, mut n_expected) = (0.0_f64, 0.0, 0.0);
-    let likelihood = model.likelihood();
-    for _ in 0..200 {
-        let starts = client.observe(0..2).expect("observe");
-        let flown = paths.take(N_MOVES, 2);
-        let seen = client.step(0..2, &flown).expect("step");
-        let world = seen[0].world;
-        let states = loop {
-            let sample = truth.receive(PATIENCE).expect("receive").expect("a state");
-            if (sample.header.step, sample.header.episode) == (world.step, world.episode) {
-                break sample.payload;
-            }
-        };
-        let mut paying = BTreeSet::new();
-        for ((before, path), after) in starts.iter().zip(&flown).zip(&seen) {
-            let flight = airspace.fly(before.robot.cell(), path);
-            assert_eq!(after.robot.cell(), flight.end);
-            assert_eq!(after.robot.n_visited as usize, flight.visited.len());
-            let in_sight = airspace.see(&flight.visited);
-            for (cell, &value) in after.frame.as_bytes().iter().enumerate() {
-                let is_seen = in_sight.contains(&cell);
-                assert_eq!(value != UNOBSERVED, is_seen, "cell {cell}");
-                if is_seen && !flight.visited.contains(&cell) {
-                    let state = usize::from(states[cell]);
-                    n_seen += 1.0;
-                    n_right += f64::from(u8::from(value == states[cell]));
-                    n_expected += likelihood[[state, state]];
-                }
-            }
-            paying.extend(flight.visited);
-        }
-        let burning = paying.iter().filter(|&&cell| states[cell] == 1).count();
-        assert_eq!(world.reward, burning as f64);
-        total += world.reward;
-    }
-    assert!(total > 0.0, "no fire was met");
-    // A count of independent readings has a standard error of at most sqrt(n) / 2. Two robots may count a reading twice.
-    let bound = 4.0 * n_seen.sqrt();
-    let off = (n_right - n_expected).abs();
-    assert!(off < bound, "{n_right} of {n_seen}: expected {n_expected}");
-}
-
-#[test]
-fn snapshots_and_agents_of_a_land_go_on() {
+fn hello_describes_a_land_agents_act_on_it_and_another_refuses_its_snapshot() {
     let folder = Folder::default();
     let model = write_model(&folder, 2);
     let snapshot = folder.word("a.snapshot");
     let server = Server::start(&flags(&model));
-    let mut client = server.acquire(0..2);
-    let future = |client: &mut Client, seed| {
-        let mut paths = Paths::new(seed);
-        let mut step = || client.step(0..2, &paths.take(N_MOVES, 2)).expect("step");
-        (0..5).map(|_| step()).collect::<Vec<_>>()
-    };
-    future(&mut client, 1);
     server.command(&format!("snapshot {snapshot}")).check(0);
-    let went_on = future(&mut client, 2);
-    let restore = format!("--restore {snapshot}");
-    let again = Server::start(&format!("{} {restore}", flags(&model)));
-    assert_eq!(future(&mut again.acquire(0..2), 2), went_on);
+    let info = server.info();
+    let airspace = info.airspace().expect("an airspace");
+    assert_eq!((airspace.radius(), airspace.is_open()), (2, false));
+    let model = Model::from_toml(&info.model.expect("revealed")).expect("a model with its map");
+    let maps = model.hazards().expect("hazards").maps();
+    assert_eq!(maps["fuel"].shape(), [7, 9]);
     for policy in [
         "known/beam/exploit",
         "known/shooting/explore",
@@ -129,56 +63,33 @@ fn snapshots_and_agents_of_a_land_go_on() {
     ] {
         agent(&format!(
             "run {} --policy {policy} --steps 3 --team joint",
-            on(&again)
+            on(&server)
         ));
     }
     let other = flags(&write_model(&folder, 1));
+    let restore = format!("--restore {snapshot}");
     check(SERVER, &format!("{other} {restore}"), "model: expected");
 }
 
 #[test]
-fn a_land_that_cannot_be_is_refused_and_pockets_are_told_of() {
+fn cells_that_no_fly_cells_cut_off_are_told_of() {
     let folder = Folder::default();
     let model = write_model(&folder, 2);
     let land = format!("--model {model} --height 7 --width 9 --burn-in 0");
     let text = folder.text("land.toml");
     let (head, rest) = text.split_once("no_fly = ").expect("a map");
-    let (wall, rest) = rest.split_once('\n').expect("its end");
-    for (no_fly, start, words) in [
-        (
-            wall,
-            "0,4",
-            "start: expected a cell where robots may be, got (0, 4), a no-fly cell",
-        ),
-        (
-            &map(|row, col| usize::from(row + col == 1)),
-            "corner",
-            "start: expected a cell that robots can leave, got (0, 0), which no-fly cells cut off",
-        ),
-        (
-            &map(|row, col| (row + col) % 2),
-            "random",
-            "start: expected a cell that robots can leave",
-        ),
-        ("\"missing.npy\"", "corner", "missing.npy"),
-    ] {
-        folder.write("land.toml", format!("{head}no_fly = {no_fly}\n{rest}"));
-        check(SERVER, &format!("{land} --start {start}"), words);
-    }
+    let (_, rest) = rest.split_once('\n').expect("its end");
     // A map in which no-fly cells enclose two free cells.
     let pocket = map(|row, col| {
         usize::from(row < 3 && col < 4 && (row, col) != (1, 1) && (row, col) != (1, 2))
     });
     folder.write("land.toml", format!("{head}no_fly = {pocket}\n{rest}"));
-    let share = "no-fly cells cut off 2 of 53 free cells (3.77 %)";
-    let random = run(SERVER, &format!("--check {land} --start random")).check(0);
-    random.check_says(share).check_prints("start = \"random\"");
-    random.check_says("model \"land\": 3 states, 3 transitions, maps 7 x 9");
-    assert!(!random.stderr.contains("WARN"), "{}", random.stderr);
-    let closed_in = run(SERVER, &format!("--check {land} --start 1,2")).check(0);
-    closed_in.check_says(share).check_says(
+    let checked = run(SERVER, &format!("--check {land} --start 1,2")).check(0);
+    for words in [
+        "no-fly cells cut off 2 of 53 free cells (3.77 %)",
         "start: no-fly cells enclose (1, 2): robots that start there reach 2 of 53 free cells",
-    );
-    let server = Server::start(&format!("{land} --start random"));
-    server.program.wait_for_words(share);
+        "model \"land\": 3 states, 3 transitions, maps 7 x 9",
+    ] {
+        checked.check_says(words);
+    }
 }

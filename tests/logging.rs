@@ -1,4 +1,4 @@
-//! The output of the programs: a reader that pauses or leaves stops none of them, and colours follow the environment.
+//! The output of the programs: a reader that pauses or leaves stops none of them.
 
 use crate::commands::TINY;
 use emberwatch_protocol::Connection;
@@ -45,14 +45,17 @@ fn wait(mut child: Child) -> ExitStatus {
     child.wait().expect("a child process")
 }
 
-fn open_terminal() -> (File, File) {
+/// A terminal in which Ctrl-S was pressed.
+fn paused_terminal() -> (OwnedFd, OwnedFd) {
     let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
     grantpt(&terminal).expect("a terminal");
     unlockpt(&terminal).expect("a terminal");
     let name = ptsname(&terminal, Vec::new()).expect("a name");
     let name = name.to_str().expect("ASCII");
     let end = File::options().read(true).write(true).open(name);
-    (terminal.into(), end.expect("open the terminal"))
+    let end = end.expect("open the terminal");
+    tcflow(&end, Action::OOff).expect("pause");
+    (terminal, end.into())
 }
 
 /// A full pipe, and its reader, which must stay open.
@@ -61,13 +64,6 @@ fn full_pipe() -> (OwnedFd, OwnedFd) {
     let size = fcntl_setpipe_size(&writer, PIPE).expect("a small pipe");
     writer.write_all(&vec![b'\n'; size]).expect("fill the pipe");
     (reader.into(), writer.into())
-}
-
-/// A terminal in which Ctrl-S was pressed.
-fn paused_terminal() -> (OwnedFd, OwnedFd) {
-    let (terminal, end) = open_terminal();
-    tcflow(&end, Action::OOff).expect("pause");
-    (terminal.into(), end.into())
 }
 
 fn connect(instance: &Instance) -> Connection {
@@ -154,86 +150,6 @@ fn dropped_lines_are_counted_and_reported() {
     assert!(n_logged < N_REFUSED);
     assert_eq!(n_dropped.map(|dropped| n_logged + dropped), Some(N_REFUSED));
     assert!(log.trim_end().ends_with("stopped n_steps=0"), "{report:?}");
-}
-
-#[test]
-fn colours_follow_the_terminal_and_the_environment() {
-    for (environment, on_terminal, elsewhere) in [
-        ("TERM=xterm", true, false),
-        ("TERM=dumb", false, false),
-        ("NO_COLOR=1", false, false),
-        ("NO_COLOR=", true, false),
-        ("CLICOLOR_FORCE=1", true, true),
-        ("CLICOLOR_FORCE=0", true, false),
-        ("TERM=dumb CLICOLOR_FORCE=1", true, true),
-        ("NO_COLOR=1 CLICOLOR_FORCE=1", false, false),
-    ] {
-        let variables = environment.split(' ').map(|set| set.split_once('='));
-        let log_on = |stderr: OwnedFd| {
-            Command::new(program_path(SERVER))
-                .args(["--check", "--states-offset", "3"])
-                .env("TERM", "xterm")
-                .env_remove("NO_COLOR")
-                .env_remove("CLICOLOR_FORCE")
-                .envs(variables.clone().flatten())
-                .stderr(stderr)
-                .status()
-                .expect("run the server");
-        };
-        let (mut terminal, end) = open_terminal();
-        log_on(end.into());
-        let mut seen = Vec::new();
-        // A terminal whose other end is closed answers with an error.
-        let _ = terminal.read_to_end(&mut seen);
-        let (mut reader, writer) = pipe().expect("a pipe");
-        log_on(writer.into());
-        let mut piped = Vec::new();
-        reader.read_to_end(&mut piped).expect("the log");
-        let are_coloured = [seen, piped].map(|log| {
-            assert!(
-                String::from_utf8_lossy(&log).contains("states_offset"),
-                "{environment}"
-            );
-            log.contains(&b'\x1b')
-        });
-        assert_eq!(are_coloured, [on_terminal, elsewhere], "{environment}");
-    }
-}
-
-#[test]
-fn unusable_levels_are_named_once_and_the_default_holds() {
-    let manifest = include_str!("../Cargo.toml").lines();
-    let crates =
-        manifest.filter_map(|line| line.strip_prefix("emberwatch-")?.split_once(" = { path"));
-    let levels: Vec<String> = crates
-        .map(|(name, _)| format!("emberwatch_{name}=info"))
-        .collect();
-    assert!(levels.len() > 5, "{levels:?}");
-    // The level, the number of warnings about it, and whether the default level holds.
-    for (level, n_warnings, is_default) in [
-        (Some(&*levels.join(",")), 0, true),
-        (None, 0, true),
-        (Some(""), 0, true),
-        (Some(" , "), 0, true),
-        (Some("emberwatch"), 0, true),
-        (Some("warn,emberwatch_sim=info,tokio=warn"), 0, false),
-        (Some("inof"), 1, true),
-        (Some("info,emberwatch-server=debug"), 1, true),
-        (Some("emberwatch_sever=info"), 1, true),
-        (Some("info=info=info"), 1, true),
-    ] {
-        let mut command = Command::new(program_path(AGENT));
-        command.args(["run", "--instance", "nobody", "--wait", "1"]);
-        command
-            .env_remove("RUST_LOG")
-            .envs(level.map(|level| ("RUST_LOG", level)));
-        let log = command.output().expect("run the agent").stderr;
-        let log = String::from_utf8(log).expect("text");
-        let count = |words| log.matches(words).count();
-        assert_eq!(count("RUST_LOG: expected"), n_warnings, "{level:?}: {log}");
-        assert_eq!(count("ERROR"), 1, "{level:?}: {log}");
-        assert_eq!(count(" INFO ") > 0, is_default, "{level:?}: {log}");
-    }
 }
 
 #[test]

@@ -1,16 +1,14 @@
-//! Tests of recorded worlds: the truth channel shows the recorded states, and agents act there without a known model.
+//! Tests of recorded worlds: servers show and restore them, and agents act there without a known model.
 
 use crate::commands::{agent, check, check_table};
 use crate::trainings::on;
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::client::truth::TruthFeed;
-use emberwatch_protocol::connection::ConnectionError;
-use emberwatch_protocol::message::Status;
+use emberwatch_protocol::Shape;
 use emberwatch_protocol::model::Description;
-use emberwatch_protocol::{Client, Grid, Shape};
 use ndarray::{Array3, Axis};
 use ndarray_npy::WriteNpyExt;
-use tests::harness::{AGENT, Folder, Paths, SERVER, Server, reset, send_paths};
+use tests::harness::{AGENT, Folder, SERVER, Server, fly_on, reset};
 use tests::meter::memory;
 
 const N_MOVES: usize = 4;
@@ -81,72 +79,12 @@ impl Place {
         let folder = self.folder.word("");
         format!("--states {folder} --moves {N_MOVES} --publish-truth {more}")
     }
-
-    /// Returns one recorded step of the sequence that a seed selects if symmetries are disabled.
-    fn states(&self, seed: u64, recorded_step: usize) -> Grid<u8> {
-        let sequence = &self.sequences[seed as usize % self.sequences.len()];
-        sequence.index_axis(Axis(0), recorded_step).to_owned()
-    }
 }
 
 fn truth_of(server: &Server) -> TruthFeed {
     let info = server.info();
     let shape = Shape::new(info.height, info.width).expect("a shape");
     TruthFeed::open(&server.instance, shape).expect("truth")
-}
-
-/// Flies a whole episode, which must end by truncation. Checks that full frames show the states of the truth channel,
-/// and returns these states.
-fn episode(client: &mut Client, truth: &TruthFeed, seed: u64) -> Vec<Grid<u8>> {
-    reset(client, seed);
-    let mut shown = truth.states(0..1, &[seed], 0).expect("truth");
-    let mut paths = Paths::new(seed);
-    loop {
-        let seen = send_paths(client, paths.next(N_MOVES));
-        let states = truth.states(0..1, &[seed], seen.world.step).expect("truth");
-        assert_eq!(seen.frame.values(), states[0], "sensors that never err");
-        let n_burning = states[0].iter().filter(|&&state| state == 1).count();
-        assert_eq!(seen.world.n_target_cells as usize, n_burning);
-        shown.extend(states);
-        if seen.world.truncated != 0 {
-            return shown;
-        }
-    }
-}
-
-#[test]
-fn recorded_states_replay_from_their_offset_to_their_end() {
-    let place = Place::new(&[5, 8], (3, 5));
-    let lengths = place.sequences.iter().map(|states| states.len_of(Axis(0)));
-    let lengths: Vec<usize> = lengths.collect();
-    let server = Server::start(&place.flags("--coverage full --states-offset 3"));
-    let (truth, mut client) = (truth_of(&server), server.acquire(0..1));
-    let mut offsets = Vec::new();
-    for seed in 0..8 {
-        let shown = episode(&mut client, &truth, seed);
-        let offset = lengths[seed as usize % 2] - shown.len();
-        offsets.push(offset);
-        for (k, states) in shown.iter().enumerate() {
-            assert_eq!(
-                *states,
-                place.states(seed, offset + k),
-                "seed {seed}, step {k}"
-            );
-        }
-    }
-    let most = offsets.iter().max();
-    assert!(
-        most <= Some(&3) && most > offsets.iter().min(),
-        "{offsets:?}"
-    );
-    let over = client.step(0..1, &Paths::new(1).take(N_MOVES, 1));
-    let Err(ConnectionError::Refused { status, .. }) = over else {
-        panic!("expected a refusal, got {over:?}");
-    };
-    assert_eq!(status, Status::EpisodeOver);
-    let server = Server::start(&place.flags("--coverage full --max-steps 3"));
-    let shown = episode(&mut server.acquire(0..1), &truth_of(&server), 7);
-    assert_eq!(shown.len(), 1 + 3);
 }
 
 #[test]
@@ -167,35 +105,24 @@ fn hello_tells_of_the_recorded_world_and_keeps_what_it_shall() {
 #[test]
 fn a_restored_world_goes_on_and_another_states_file_is_refused() {
     let (place, other) = (Place::new(&[9, 12], (4, 4)), Place::new(&[9, 13], (4, 4)));
-    let settings = "--states-symmetries --states-offset 3 --start random --robots 2";
+    let settings = "--states-symmetries --states-offset 3 --start random";
     let server = Server::start(&place.flags(settings));
-    let future = |client: &mut Client, truth: &TruthFeed| -> Vec<_> {
-        let mut paths = Paths::new(5);
-        let mut step = || {
-            let shown = client.step(0..2, &paths.take(N_MOVES, 2)).expect("step");
-            let states = truth.states(0..1, &[21], shown[0].world.step);
-            (shown, states.expect("truth"))
-        };
-        (0..3).map(|_| step()).collect()
+    let future = |server: &Server| {
+        let (mut client, truth) = (server.acquire(0..1), truth_of(server));
+        let seen = fly_on(&mut client, 5, 3);
+        let last = &seen[2].world;
+        let states = truth.states(0..1, &[last.seed], last.step).expect("truth");
+        (seen, states)
     };
-    let (mut client, truth) = (server.acquire(0..2), truth_of(&server));
-    reset(&mut client, 21);
-    future(&mut client, &truth);
+    reset(&mut server.acquire(0..1), 21);
     let folder = Folder::default();
     let file = folder.word("lab.snapshot");
     server.command(&format!("snapshot {file}")).check(0);
-    let went_on = future(&mut client, &truth);
-    let restore = format!("restore {file} --takeover");
-    server.command(&restore).check(0);
-    assert_eq!(future(&mut server.acquire(0..2), &truth), went_on);
-    let again = Server::start(&place.flags(&format!("{settings} --restore {file}")));
-    assert_eq!(future(&mut again.acquire(0..2), &truth_of(&again)), went_on);
+    let settings = format!("{settings} --restore {file}");
+    let again = Server::start(&place.flags(&settings));
+    assert_eq!(future(&again), future(&server));
     let words = "states: expected 2 sequences of CRC-32 ";
-    check(
-        SERVER,
-        &other.flags(&format!("{settings} --restore {file}")),
-        words,
-    );
+    check(SERVER, &other.flags(&settings), words);
 }
 
 #[test]

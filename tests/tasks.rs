@@ -1,10 +1,10 @@
-//! Tests of tasks: a task has the same worlds as the equivalent flags, and `hello`, `status` and snapshots name it.
+//! Tests of tasks: `hello`, `status` and snapshots name them, and commands take worlds, steps and seeds from them.
 
 use crate::commands::{agent, check, check_table};
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_protocol::task::Task;
 use emberwatch_sim::snapshot::decode;
-use tests::harness::{AGENT, Folder, SERVER, Server, fly_on, repository, reset};
+use tests::harness::{AGENT, Folder, SERVER, Server, repository};
 
 /// The settings of the task `small` as flags.
 const SMALL_BY_HAND: &str =
@@ -15,20 +15,6 @@ fn mine(task: &str) -> String {
     let text = std::fs::read_to_string(repository().join(format!("config/tasks/{task}.toml")));
     let text = text.expect("the task");
     text.replace(&format!("name = \"{task}\""), "name = \"mine\"")
-}
-
-#[test]
-fn a_task_has_the_worlds_of_its_flags() {
-    let seen = |flags: &str| {
-        let server = Server::start(flags);
-        let mut client = server.acquire(0..1);
-        reset(&mut client, 7);
-        (fly_on(&mut client, 1, 20), server.info().max_steps)
-    };
-    let by_name = seen("--task small");
-    let file = repository().join("config/tasks/small.toml");
-    assert_eq!(by_name, seen(&format!("--task {}", file.display())));
-    assert_eq!(by_name, seen(SMALL_BY_HAND));
 }
 
 #[test]
@@ -104,9 +90,7 @@ fn wrong_tasks_and_flags_that_a_task_decides_are_refused_by_name() {
     let words = "model: expected a regular file, got a pipe";
     check(SERVER, &format!("--task {of_pipe}"), words);
     let table =
-        "--task small --height 3 => height: expected to be left out, as the task decides it, got 3
---task small --start corner => start: expected to be left out, as the task decides it
---task small --sensor-radius 1 => sensor_radius: expected to be left out, as the task decides it
+        "--task small --sensor-radius 1 => sensor_radius: expected to be left out, as the task decides it
 --task jacksboro --states-offset 3 => states_offset: expected to be left out, as the task decides it
 --task= => task : expected a name or a file, got \"\"
 --task FILE => missing field `test_seeds`

@@ -42,41 +42,31 @@ const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 /// Capacity of the queue to the writing thread: about 16,000 frames of 64 x 64 cells.
 const MAX_QUEUED_BYTES: usize = 64 << 20;
 
-/// The client name that servers log.
 const NAME: &str = "emberwatch-server record";
 
-/// Options of a recording.
 #[derive(Debug)]
 pub struct RecordOptions {
     /// The instance to record. Its server may start later, and may end and restart.
     pub instance: Instance,
     pub out: PathBuf,
-    /// Whether to overwrite an existing file.
     pub overwrite: bool,
     /// Whether to record hidden states, where the server publishes them.
     pub truth: bool,
-    /// Number of world steps to record, or 0 for no limit.
     pub n_steps: u64,
     /// The worlds to record. If empty, all worlds are recorded.
     pub worlds: Vec<u32>,
 }
 
-/// A summary of a recording.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RecordSummary {
     pub totals: Totals,
     /// Number of recorded world steps.
     pub n_steps: u64,
-    /// Length of the file in bytes.
     pub n_bytes: u64,
     /// Number of samples that were not recorded, because their server did not answer `hello`.
     pub n_unknown: u64,
 }
 
-/// Records until `stop` is set or the requested number of steps is reached.
-///
-/// # Errors
-/// If the file cannot be written or the instance cannot be observed. Earlier records remain in the file.
 pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummary> {
     // Sends `hello` before it starts to observe, because a fast agent would overflow the observer's buffer during the
     // wait for the answer.
@@ -125,7 +115,6 @@ struct Recorder<'a> {
     began: Instant,
     /// The answer to the `hello` that was sent before the first sample arrived.
     first_server: Option<ServerInfo>,
-    /// The server process whose samples are being recorded.
     server: Option<u32>,
     /// A server process that did not answer `hello`, and the time at which it was asked.
     silent: Option<(u32, Instant)>,
@@ -322,7 +311,6 @@ impl Channel {
     }
 }
 
-/// The writing thread and its queue.
 struct Writing {
     queue: Sender<Record>,
     n_queued_bytes: Arc<AtomicUsize>,

@@ -10,6 +10,8 @@
 //! Terms: a *world* is the hidden state of one grid. A *step* `k` flies one path with each robot and moves the world
 //! once. A *frame* contains the observations of a step. A *lease* is the right to fly robots.
 
+#![allow(missing_docs, reason = "self-explanatory names need no docs")]
+
 #[cfg(feature = "program")]
 mod flags;
 #[cfg(feature = "program")]

@@ -6,6 +6,7 @@
 use emberwatch_messages::limits::threads::spawn;
 use emberwatch_model::text::shortened;
 use std::backtrace::{Backtrace, BacktraceStatus};
+use std::ffi::OsString;
 use std::io::{IsTerminal, Write, stderr};
 use std::mem::take;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -33,7 +34,6 @@ static WAITING: Mutex<Waiting> = Mutex::new(Waiting {
 });
 static CHANGED: Condvar = Condvar::new();
 
-/// The part of the log that is not written yet.
 struct Waiting {
     text: Vec<u8>,
     /// Number of lines that were dropped after the text.
@@ -47,7 +47,6 @@ struct Waiting {
 #[must_use]
 pub struct Log;
 
-/// Adds lines to the waiting text.
 struct Lines;
 
 /// Starts logging to standard error. `RUST_LOG` sets the level, also per target (`warn`,
@@ -60,7 +59,10 @@ pub fn start_logging() -> Log {
     let log = tracing_subscriber::fmt::layer()
         .with_writer(|| Lines)
         .with_target(false)
-        .with_ansi(has_colours());
+        .with_ansi(has_colours(
+            |name| std::env::var_os(name),
+            stderr().is_terminal(),
+        ));
     let default = || Targets::new().with_default(LevelFilter::INFO);
     tracing_subscriber::registry()
         .with(log.with_filter(filter.clone().unwrap_or_else(default)))
@@ -168,11 +170,65 @@ fn is_ours(end: &str) -> bool {
 }
 
 /// Returns whether the log has colours: on a terminal, unless the environment decides (no-color.org, bixense.com/clicolors).
-fn has_colours() -> bool {
-    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
+fn has_colours(variable: impl Fn(&str) -> Option<OsString>, is_terminal: bool) -> bool {
+    let set = |name| variable(name).filter(|value| !value.is_empty());
     if set("NO_COLOR").is_some() {
         return false;
     }
     set("CLICOLOR_FORCE").is_some_and(|value| value != "0")
-        || stderr().is_terminal() && set("TERM").is_none_or(|term| term != "dumb")
+        || is_terminal && set("TERM").is_none_or(|term| term != "dumb")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_follow_the_terminal_and_the_environment() {
+        for (environment, on_terminal, elsewhere) in [
+            ("TERM=xterm", true, false),
+            ("TERM=dumb", false, false),
+            ("NO_COLOR=1", false, false),
+            ("NO_COLOR=", true, false),
+            ("CLICOLOR_FORCE=1", true, true),
+            ("CLICOLOR_FORCE=0", true, false),
+            ("TERM=dumb CLICOLOR_FORCE=1", true, true),
+            ("NO_COLOR=1 CLICOLOR_FORCE=1", false, false),
+        ] {
+            let variable = |name: &str| {
+                let mut set = environment.split(' ').filter_map(|set| set.split_once('='));
+                Some(set.find(|(known, _)| *known == name)?.1.into())
+            };
+            let coloured = [true, false].map(|is_terminal| has_colours(variable, is_terminal));
+            assert_eq!(coloured, [on_terminal, elsewhere], "{environment}");
+        }
+    }
+
+    #[test]
+    fn levels_and_crates_of_ours_are_known() {
+        let manifest = include_str!("../../Cargo.toml").lines();
+        let names = manifest
+            .filter_map(|line| Some(line.strip_prefix("emberwatch-")?.split_once(" = { path")?.0));
+        let all: Vec<String> = names
+            .map(|name| format!("emberwatch_{name}=info"))
+            .collect();
+        assert!(all.len() > 5, "{all:?}");
+        for text in [
+            &all.join(","),
+            "",
+            " , ",
+            "emberwatch",
+            "warn,emberwatch_sim=info,tokio=warn",
+        ] {
+            assert!(targets(text).is_some(), "{text:?}");
+        }
+        for text in [
+            "inof",
+            "info,emberwatch-server=debug",
+            "emberwatch_sever=info",
+            "info=info=info",
+        ] {
+            assert!(targets(text).is_none(), "{text:?}");
+        }
+    }
 }

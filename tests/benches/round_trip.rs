@@ -5,43 +5,43 @@
 //! machine as it is, then with three additional busy processes. Then prints the processor time of an idle server.
 //! `scripts/bench` measures Gymnasium's AsyncVectorEnv in the same run for comparison.
 
+use emberwatch_protocol::Client;
 use std::ops::Range;
 use std::sync::Barrier;
 use std::time::{Duration, Instant};
 use tests::harness::{Program, Server};
 use tests::meter::processor_seconds;
 use tests::report::{quantiles, say};
-use tests::stepper::Stepper;
 
 const N_STEPS: usize = 50_000;
 
 /// A client whose robots fly the same paths in every step.
 struct Flight {
-    stepper: Stepper,
+    client: Client,
     paths: Vec<u8>,
 }
 
 impl Flight {
     fn new(server: &Server, robots: Range<u32>) -> Self {
-        let stepper = Stepper::new(server.connect(), robots.clone());
-        let n_moves = stepper.connection.info().n_moves * robots.len();
+        let client = server.take_over(robots.clone());
+        let n_moves = client.info().n_moves * robots.len();
         let paths = (0..n_moves).map(|at| (at * 7 % 4) as u8).collect();
-        Self { stepper, paths }
+        Self { client, paths }
     }
 
     /// Returns the duration of one round trip and the part of it spent in the simulation, in nanoseconds.
     fn step(&mut self) -> (u64, u64) {
-        let start = Instant::now();
-        let answer = self.stepper.step(&self.paths);
+        let (start, robots) = (Instant::now(), self.client.robots());
+        let answer = self.client.step_bytes(&robots, &self.paths);
         let total = start.elapsed().as_nanos() as u64;
-        (total, answer.0.simulation_nanos.min(total))
+        (total, answer.expect("a step").0.simulation_nanos.min(total))
     }
 
     fn report(&mut self, what: &str, n_steps: usize) {
         (0..n_steps / 10).for_each(|_| _ = self.step());
         let start = Instant::now();
         let times: Vec<(u64, u64)> = (0..n_steps).map(|_| self.step()).collect();
-        let n_worlds = self.stepper.lease.worlds().len();
+        let n_worlds = self.client.worlds_of(&self.client.robots()).len();
         let per_second = (n_steps * n_worlds) as f64 / start.elapsed().as_secs_f64();
         let wire = spread(times.iter().map(|(total, simulation)| total - simulation));
         let simulation = spread(times.iter().map(|(_, simulation)| *simulation));

@@ -81,8 +81,6 @@ impl Target {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_protocol::Model;
-    use emberwatch_protocol::control::{Reply, Request, parse};
 
     #[test]
     fn every_target_has_a_program_and_the_seeds_of_this_release() {
@@ -102,35 +100,5 @@ mod tests {
         }
         let n_programs = std::fs::read_dir(programs).expect("the programs").count();
         assert_eq!(n_programs, TARGETS.len());
-    }
-
-    #[test]
-    fn the_texts_of_the_corpus_are_of_this_release() {
-        let reply: fn(&str) -> bool = |text| parse::<Reply>(text.as_bytes()).is_ok();
-        let model: fn(&str) -> bool = |text| Model::from_toml(text).is_ok();
-        // Skips the first byte, which is not part of the request: it selects the client and the events before the
-        // request.
-        let request: fn(&str) -> bool =
-            |text| parse::<Request>(text[1..].replace("LEASE", "1").as_bytes()).is_ok();
-        for (folder, names, is_read) in [
-            ("control_reply", "hello land lease status error", reply),
-            (
-                "model",
-                "burnout.toml land.toml line.toml sparse.toml wildfire.toml",
-                model,
-            ),
-            (
-                "control_request",
-                "acquire belief fork hello leave_belief release renew reset reset_none \
-                 restore shutdown snapshot status takeover",
-                request,
-            ),
-        ] {
-            for name in names.split(' ') {
-                let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus");
-                let text = std::fs::read_to_string(corpus.join(folder).join(name)).expect(name);
-                assert!(is_read(&text), "{folder}/{name}: {text}");
-            }
-        }
     }
 }

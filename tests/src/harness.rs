@@ -76,14 +76,6 @@ impl Server {
         }
     }
 
-    /// Starts a server and waits until it answers, while its worlds are still in their burn-in.
-    pub fn start_in_burn_in(flags: &str) -> Self {
-        let server = Self::start_without_waiting(&new_instance(), flags);
-        let answers = || status_within(&server.instance, START).is_ok();
-        server.program.until(answers);
-        server
-    }
-
     /// Starts a server with two worlds of the size of [`SMALL`] at k = 0. If these worlds are reset, the burn-in never
     /// ends.
     pub fn start_with_endless_resets(flags: &str) -> Self {

@@ -5,9 +5,7 @@
 pub mod fuzz;
 pub mod harness;
 pub mod meter;
-pub mod mirror;
 mod programs;
 pub mod report;
 pub mod siege;
-pub mod stepper;
 pub mod wire;

@@ -1,58 +1,6 @@
 //! Measures the resources that a process uses.
 
-use emberwatch_protocol::channels::SHARED_MEMORY;
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-
-/// The memory, descriptors and shared memory in use at one moment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Use {
-    /// Resident memory of the process, in KiB.
-    pub resident: u64,
-    pub descriptors: usize,
-    /// Number of files of this user's channels, for all instances.
-    pub files: usize,
-    /// Disk blocks that these files occupy, in KiB.
-    pub shared: u64,
-}
-
-impl Use {
-    /// Measures a process.
-    pub fn of(pid: u32) -> Self {
-        let user = rustix::process::getuid().as_raw();
-        let own = format!("{SHARED_MEMORY}/emberwatch-{user}");
-        let is_own = |path: &PathBuf| {
-            let path = path.to_string_lossy();
-            let rest = path.strip_prefix(&own);
-            rest.is_some_and(|rest| rest.starts_with(['_', '/']))
-        };
-        let mut files = all_under(Path::new(SHARED_MEMORY));
-        files.retain(|path| is_own(path) && !path.is_dir());
-        // The number of allocated blocks of a file. A block has 512 bytes.
-        let blocks = |path: &PathBuf| path.metadata().map_or(0, |file| file.blocks());
-        Self {
-            resident: memory("VmRSS:", pid),
-            descriptors: n_descriptors(pid),
-            files: files.len(),
-            shared: files.iter().map(|path| blocks(path) / 2).sum(),
-        }
-    }
-}
-
-impl std::fmt::Display for Use {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self {
-            resident,
-            descriptors,
-            files,
-            shared,
-        } = self;
-        write!(
-            f,
-            "{resident} KiB resident, {descriptors} descriptors, {files} channel files, {shared} KiB shared"
-        )
-    }
-}
 
 /// Parses the value, in KiB, from the line of `/proc/<pid>/status` that begins with `line`. Returns 0 if there is no
 /// such line.

@@ -160,14 +160,6 @@ pub fn observe_header(robots: Range<u32>) -> StepRequest {
     }
 }
 
-/// Returns the header of a correct request to recall robots at past steps.
-pub fn recall_header(robots: Range<u32>) -> StepRequest {
-    StepRequest {
-        operation: Operation::Recall as u32,
-        ..observe_header(robots)
-    }
-}
-
 /// Returns the payload of a step request for worlds that are at these steps.
 pub fn step_body(steps: &[u64], paths: &[u8]) -> Vec<u8> {
     let mut body = Vec::new();

@@ -2,7 +2,6 @@
 
 import { channels } from "./palette.js";
 
-/** Creates an element with a class, data attributes and text. */
 export function make(tag, name = "", dataset = {}, text = "") {
   const made = document.createElement(tag);
   if (name) made.className = name;
@@ -11,7 +10,6 @@ export function make(tag, name = "", dataset = {}, text = "") {
   return made;
 }
 
-/** Creates a small square of a colour. */
 export function swatch(color) {
   const square = make("i", "swatch");
   square.style.background = `rgb(${channels(color).join(" ")})`;

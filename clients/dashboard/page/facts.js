@@ -6,7 +6,6 @@ import { beliefAge, isTeam, short, stateNames, targetName, text, whole } from ".
 
 const byId = (id) => document.getElementById(id);
 
-/** Creates the functions that write a picture's texts. */
 export function createFacts() {
   const announce = byId("announce");
   const robots = createRobots(byId("robots"));
@@ -159,7 +158,6 @@ function drawEmpty(picture) {
   write(byId("empty-command"), `emberwatch-server --instance ${instance}`);
 }
 
-/** Returns the page's title. */
 export function titleOf(picture) {
   if (!picture?.shown) return "Emberwatch";
   return `k ${whole(picture.shown.step)} · ${picture.info?.model ?? stateNames(picture).join("/")} · Emberwatch`;

@@ -8,7 +8,6 @@ import { beliefAge, beliefNames, isTeam, observationNames, seenSince, short, sta
 // Time from the last key to the announcement of the cell, so that held keys do not flood a screen reader.
 const QUIET_MILLIS = 400;
 
-/** Creates the inspector: its element, and functions to draw and announce a cell. */
 export function createInspector(announcer) {
   const root = make("section", "inspector");
   root.setAttribute("aria-label", "one cell in numbers");
@@ -18,7 +17,6 @@ export function createInspector(announcer) {
   let timer = 0;
   let shownKey = "";
 
-  /** Draws `cell`, the pointed-at cell. If `cell` is null, draws the first robot's cell. */
   function draw(picture, cell, palette) {
     const at = cell ?? robotCell(picture);
     if (!at) return;

@@ -7,7 +7,6 @@ import { beliefNames, observationNames, stateNames } from "./words.js";
 // Maximum number of names. More names would leave no space for the panels.
 const MAX_NAMES = 16;
 
-/** Creates the legends above and below the panels, which are redrawn only when they change. */
 export function createLegend(list, ramps) {
   let drawn = "";
   return {

@@ -11,7 +11,6 @@ import { isTeam } from "./words.js";
 const DARK = "#141414";
 const LIGHT = "#ffffff";
 
-/** Draws the marks of one panel, with paths and robots if `hasPaths`. */
 export function drawMarks(canvas, picture, { cell, hasPaths }) {
   const drawn = prepare(canvas);
   if (!drawn) return;

@@ -80,7 +80,6 @@ function make({ states: ownStates, observations: ownObservations, theme }) {
   };
 }
 
-/** Returns the colour of an objective: the colour of the state with this name, or otherwise a separate colour. */
 export function objectiveColor(name, { objectives, names, palette }) {
   if (name === IDLE.name) return IDLE.color;
   const state = names.indexOf(name);
@@ -90,17 +89,14 @@ export function objectiveColor(name, { objectives, names, palette }) {
   return OBJECTIVES[at] ?? generated(at);
 }
 
-/** Returns the colour of a team's robot. */
 export function robotColor(at) {
   return ROBOTS[at % ROBOTS.length];
 }
 
-/** Converts "#rrggbb" to [red, green, blue]. */
 export function channels(color) {
   return [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16));
 }
 
-/** Returns the colour of `value`, from 0 to 1, on a ramp, as [red, green, blue]. */
 export function rampColor(name, theme, value) {
   const stops = RAMPS[name][theme];
   const at = Math.min(Math.max(value, 0), 1) * (stops.length - 1);
@@ -108,7 +104,6 @@ export function rampColor(name, theme, value) {
   return blend(channels(stops[below]), channels(stops[below + 1]), at - below);
 }
 
-/** Returns the stops of a ramp, for legends. */
 export function rampStops(name, theme) {
   return RAMPS[name][theme];
 }

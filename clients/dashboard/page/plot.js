@@ -45,7 +45,6 @@ export function roomFor(frames, word) {
   }));
 }
 
-/** Draws a line chart with one value per bin. */
 export function drawLine(frame, values, { axis, left, hover, looked }) {
   if (!frame) return;
   const plot = { ...frame, left };
@@ -77,7 +76,6 @@ export function drawStrip(frame, values, { axis, left, hover, looked }, colors) 
   for (const serial of [looked, hover]) drawCursor({ ...plot, height }, axis, serial);
 }
 
-// Returns vertical ticks that cover the values.
 function rowsOf({ height, em }, values, apart) {
   const { low, high } = extent(values);
   const base = low > 0.6 * high ? low : Math.min(0, low);
@@ -153,7 +151,6 @@ function runsOf(values, isKnown, bridge) {
   return runs;
 }
 
-// Returns the median gap.
 function usualGap(known) {
   const gaps = known.slice(1).map((bin, i) => bin - known[i]).sort((a, b) => a - b);
   return gaps[gaps.length >> 1] ?? 1;

@@ -21,7 +21,6 @@ export function createRobots(root) {
   }
 
   return {
-    /** Draws the lines. `holders` are the processes that hold the robots, if known. */
     draw({ info, shown }, holders) {
       root.hidden = !info || !isTeam(shown);
       if (root.hidden) return;

@@ -16,7 +16,6 @@ export function tickText(value, step) {
   return value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
 }
 
-/** Returns the minimum and maximum of the numbers that are not NaN; null if there are none. */
 export function extent(values) {
   let [low, high] = [Infinity, -Infinity];
   for (const value of values) {

@@ -37,7 +37,6 @@ export function createView({ asks, changed, worlds }) {
   return { view, act };
 }
 
-/** Returns the theme in effect, "light" or "dark". */
 export function themeOf(view) {
   if (view.theme !== "auto") return view.theme;
   return darkness.matches ? "dark" : "light";

@@ -33,13 +33,11 @@ export function shapeOf(picture) {
   return of ? { height: of.height, width: of.width } : null;
 }
 
-/** Returns the number of cells of a picture's grids; null before it is known. */
 export function cellsOf(picture) {
   const shape = shapeOf(picture);
   return shape && shape.height * shape.width;
 }
 
-/** Returns the maps of the model, as { name, range }; empty if the picture shows none. */
 export function mapsOf({ info, arrays }) {
   return arrays.maps ? info.maps : [];
 }

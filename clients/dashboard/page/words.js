@@ -23,17 +23,14 @@ export function rangeOf([least, most]) {
   return `${short(least)} to ${short(most)}`;
 }
 
-/** Returns the text, or a dash if there is none. */
 export function text(value) {
   return value == null || value === "" ? UNKNOWN : String(value);
 }
 
-/** Returns the names of the hidden states, or numbered names for a hidden model. */
 export function stateNames(picture) {
   return picture.info?.states ?? picture.agent?.states ?? numbered("state", 3);
 }
 
-/** Returns the names of the observations. */
 export function observationNames(picture) {
   return picture.info?.observations ?? [];
 }
@@ -47,12 +44,10 @@ export function beliefNames(picture) {
   return names?.length === count ? names : numbered("state", count);
 }
 
-/** Returns whether a world has several robots. */
 export function isTeam(shown) {
   return shown?.robots.length > 1;
 }
 
-/** Returns the name of the state with the highest reward. */
 export function targetName(picture) {
   const target = picture.info?.target_state;
   return target == null ? "target" : stateNames(picture)[target] ?? "target";
@@ -69,7 +64,6 @@ export function beliefAge({ agent, shown }) {
   return age > 0 ? `${age === 1 ? "1 step" : `${whole(age)} steps`} old` : "";
 }
 
-/** Describes a panel in one sentence, for people who cannot see it. */
 export function panelSentence(panel, picture) {
   const { shown, info } = picture;
   if (!shown || !info) return `${panel.title}: nothing yet`;
@@ -94,7 +88,6 @@ export function panelSentence(panel, picture) {
   }
 }
 
-/** Describes a chart in one sentence. */
 export function chartSentence(title, unit, values, current) {
   const known = [...values].filter((value) => !Number.isNaN(value));
   if (known.length === 0) return `${title}: nothing yet`;

@@ -21,10 +21,6 @@ struct Place {
 }
 
 /// Checks that a request can have come from the dashboard's page. `names` are host names under which browsers can reach
-/// the dashboard.
-///
-/// # Errors
-/// A sentence about the problem, if the `Host` or `Origin` is not allowed.
 pub fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
     let text = |name: HeaderName| headers.get(name).map(|it| it.to_str().unwrap_or("?"));
     let host = text(HOST).unwrap_or("");
@@ -42,10 +38,6 @@ pub fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
     }
 }
 
-/// Parses a host name given with `--name`.
-///
-/// # Errors
-/// A sentence about the problem, if the text is not a host name, for example a URL.
 pub fn host_name(text: &str) -> Result<String, String> {
     let is_part = |byte: u8| byte.is_ascii_alphanumeric() || b".-_".contains(&byte);
     if text.is_empty() || !text.bytes().all(is_part) {
@@ -55,7 +47,6 @@ pub fn host_name(text: &str) -> Result<String, String> {
 }
 
 impl Place {
-    /// Parses `HOST` or `HOST:PORT`; IPv6 addresses are in brackets.
     fn parse(text: &str) -> Option<Self> {
         let authority: Authority = text.parse().ok()?;
         let port = match text.strip_prefix(authority.host())? {
@@ -97,7 +88,6 @@ mod tests {
     use super::*;
     use axum::http::HeaderValue;
 
-    /// Returns whether a request is answered if the dashboard was started with `--name Lab.example`.
     fn answered(host: &'static str, origin: Option<&'static str>) -> bool {
         let mut headers = HeaderMap::new();
         headers.insert(HOST, HeaderValue::from_static(host));

@@ -24,10 +24,8 @@ const MAX_BELIEF_AGE: Duration = Duration::from_secs(5);
 /// recording may store a frame and its hidden states in either order.
 const MAX_EARLY: usize = 64;
 
-/// Maximum number of bytes of held hidden states.
 const MAX_EARLY_BYTES: usize = 32 << 20;
 
-/// The kept steps of all worlds.
 #[derive(Debug, Default)]
 pub struct Album {
     worlds: BTreeMap<u32, Strip>,
@@ -45,17 +43,14 @@ pub struct Strip {
 }
 
 impl Album {
-    /// Returns a world's steps.
     pub fn strip(&self, world: u32) -> Option<&Strip> {
         self.worlds.get(&world)
     }
 
-    /// Returns the worlds that have steps.
     pub fn worlds(&self) -> impl Iterator<Item = u32> + '_ {
         self.worlds.keys().copied()
     }
 
-    /// Forgets everything, as at the start of a recording.
     pub fn clear(&mut self) {
         *self = Self::default();
     }
@@ -162,7 +157,6 @@ impl Album {
         self.worlds.retain(|_, strip| !strip.entries.is_empty());
     }
 
-    /// Removes and returns the hidden states that arrived before their frame.
     fn early_truth(&mut self, world: u32, key: Key) -> Option<Box<[u8]>> {
         let mut places = self.early.iter();
         let place = places.position(|(of, at, _)| (*of, *at) == (world, key))?;
@@ -171,7 +165,6 @@ impl Album {
 }
 
 impl Strip {
-    /// Returns the serial numbers of the first and the last kept step.
     pub fn kept(&self) -> Option<(u64, u64)> {
         let n = self.entries.len() as u64;
         (n > 0).then(|| (self.first_serial, self.first_serial + n - 1))
@@ -184,7 +177,6 @@ impl Strip {
         Some((serial, &self.entries[(serial - first) as usize]))
     }
 
-    /// Returns the steps up to a serial number, latest first.
     pub fn back_from(&self, serial: u64) -> impl Iterator<Item = &Entry> {
         let n = (serial + 1).saturating_sub(self.first_serial) as usize;
         self.entries.iter().take(n).rev()
@@ -206,12 +198,10 @@ impl Strip {
         recent.find(|entry| entry.belief.is_some())
     }
 
-    /// Returns all steps, oldest first.
     pub fn entries(&self) -> impl ExactSizeIterator<Item = &Entry> {
         self.entries.iter()
     }
 
-    /// Returns the step with this key, if it is among the latest, and the agent whose beliefs are shown.
     fn entry(&mut self, key: Key) -> Option<(&mut Entry, &mut Option<(u32, Instant)>)> {
         let mut latest = self.entries.iter_mut().rev().take(MAX_DELAY);
         let entry = latest.find(|entry| entry.key() == key)?;

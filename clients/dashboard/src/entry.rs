@@ -9,7 +9,6 @@ use emberwatch_protocol::payload::split_frame_payload;
 use emberwatch_protocol::{Airspace, Cell, Move, Shape};
 use std::time::Instant;
 
-/// One step of a world.
 #[derive(Debug)]
 pub struct Entry {
     pub shape: Shape,
@@ -21,11 +20,9 @@ pub struct Entry {
     pub truth: Option<Box<[u8]>>,
     /// An agent's belief about this step, if one was published.
     pub belief: Option<Belief>,
-    /// Time of arrival.
     pub at: Instant,
 }
 
-/// A robot's part in a step.
 #[derive(Debug, PartialEq)]
 pub struct Robot {
     pub result: RobotResult,
@@ -33,7 +30,6 @@ pub struct Robot {
     pub moves: Vec<Move>,
 }
 
-/// An agent's belief, as bytes.
 #[derive(Debug)]
 pub struct Belief {
     /// Probabilities p as `round(255 p)`: one grid per state, each row by row.
@@ -42,14 +38,11 @@ pub struct Belief {
     pub entropy: Box<[u8]>,
     pub intent: Intent,
     pub pid: u32,
-    /// Number of the first robot that the agent flies.
     pub first_robot: u32,
     pub n_robots: u32,
-    /// Scores of the belief against the hidden states, if these are known.
     pub score: Option<Score>,
 }
 
-/// Scores of a belief against the hidden states.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Score {
     /// Negative log probability of the true state, in nats, averaged over cells.
@@ -140,7 +133,6 @@ impl Entry {
 }
 
 impl Robot {
-    /// Returns the cells of the robot's path, beginning with its start.
     pub fn path(&self, airspace: &Airspace) -> Vec<Cell> {
         let mut cells = vec![self.result.start()];
         for step in &self.moves {
@@ -183,7 +175,6 @@ fn level(share: f32) -> u8 {
     (share * 255.0).round() as u8
 }
 
-/// Returns the entropy of each cell as a share of its maximum, `ln S`.
 fn entropy(published: &AgentBelief) -> Box<[u8]> {
     let (n_states, height, width) = published.belief.dim();
     let mut sums = vec![0f32; height * width];

@@ -4,7 +4,6 @@ use crate::album::Strip;
 use crate::entry::Entry;
 use emberwatch_protocol::frame::UNOBSERVED;
 
-/// The latest observation of each cell, as of some step.
 pub(crate) struct LastSeen {
     /// The latest observation of each cell, [`UNOBSERVED`] if there was none.
     pub(crate) seen: Vec<u8>,

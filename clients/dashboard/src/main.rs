@@ -17,13 +17,11 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::net::TcpListener;
 
-/// Interval at which the program checks whether to end.
 const TICK: Duration = Duration::from_millis(50);
 
 /// This process's niceness (at most 19). With it, on a busy machine, a simulator that wakes up runs first.
 const NICENESS: i32 = 5;
 
-/// The expectation that errors about `--listen` report.
 const LISTEN: &str = "expected an address of this machine and a free port; port 0 selects one";
 
 /// Shows an Emberwatch instance, or a recording, in a browser. Only reads, never acts.
@@ -92,14 +90,12 @@ fn run(cli: &Cli) -> Result<()> {
     served.context("serve the page")
 }
 
-/// Waits until the program is asked to stop, or the process of `--exit-with` has ended.
 async fn end(stop: &AtomicBool, exit_with: Option<&WatchedProcess>) {
     while !stop.load(Ordering::Relaxed) && !exit_with.is_some_and(WatchedProcess::has_ended) {
         tokio::time::sleep(TICK).await;
     }
 }
 
-/// Starts watching the instance, or playing the recording.
 fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<(Arc<Stage>, Vec<JoinHandle<()>>)> {
     match &cli.recording {
         Some(file) => {
@@ -116,7 +112,6 @@ fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<(Arc<Stage>, Vec<JoinHandl
     }
 }
 
-/// Prints the page's address, and opens the page if asked.
 fn announce(address: SocketAddr, open: bool) -> Result<()> {
     let url = format!("http://{address}/");
     print(&format!("{url}\n"))?;

@@ -17,7 +17,6 @@ macro_rules! assets {
     };
 }
 
-/// Every file of the page.
 pub const ASSETS: [Asset; 23] = assets![
     "/" "index.html" "text/html",
     "/page.css" "page.css" "text/css",

@@ -29,24 +29,20 @@ const BELIEF_LAG: Duration = Duration::from_millis(200);
 /// Time without a new belief after which an agent counts as silent.
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// A browser's request for a picture.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ask {
     pub world: u32,
     /// Serial number of a step; `None` for the newest.
     pub at: Option<u64>,
-    /// Number of points per time series.
     pub bins: usize,
     /// A recording's new speed, in the unit of [`Player::speed`].
     #[serde(default)]
     pub speed: Option<f64>,
-    /// Whether the recording should play.
     #[serde(default)]
     pub playing: Option<bool>,
 }
 
-/// Everything in a picture except its arrays.
 #[derive(Debug, Serialize)]
 struct Header<'a> {
     instance: &'a str,
@@ -136,7 +132,6 @@ struct Listing {
     length: usize,
 }
 
-/// The arrays of a picture.
 #[derive(Default)]
 struct Arrays {
     listings: Vec<Listing>,
@@ -307,7 +302,6 @@ impl Arrays {
     }
 }
 
-/// Returns an objective's index in `objectives`. Appends the objective if it is new.
 fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     let known = objectives.iter().position(|known| *known == objective);
     let number = known.unwrap_or_else(|| {

@@ -11,13 +11,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Interval at which a waiting player checks whether to continue.
 const TICK: Duration = Duration::from_millis(20);
 
-/// Starts a thread that plays a recording until `stop`. Returns the thread.
-///
-/// # Errors
-/// If the file cannot be opened or is not a recording. Later problems are shown on the page.
 pub fn play(path: &Path, stage: &Arc<Stage>, stop: &Arc<AtomicBool>) -> Result<JoinHandle<()>> {
     let mut reader = Some(open(path)?);
     let player = Player {
@@ -81,13 +76,11 @@ fn change_player(stage: &Stage, act: impl FnOnce(&mut Player)) {
     stage.change(|scene| scene.player.as_mut().map(act));
 }
 
-/// The playback of a recording.
 struct Playing<'a> {
     stage: &'a Stage,
     stop: &'a AtomicBool,
     /// Position in the recording: the recorded time that has been played.
     clock: Duration,
-    /// When the clock was last updated.
     looked: Instant,
 }
 
@@ -112,7 +105,6 @@ impl<'a> Playing<'a> {
         Ok(())
     }
 
-    /// Waits until playback reaches a moment of the recording. Returns `false` if the player is to stop.
     fn wait_for(&mut self, moment: Duration) -> bool {
         loop {
             let Some((speed, playing)) = self.orders() else {

@@ -10,7 +10,6 @@ use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
 
-/// The watched instance or recording, and its current state.
 #[derive(Debug)]
 pub struct Scene {
     pub album: Album,
@@ -22,17 +21,12 @@ pub struct Scene {
     pub note: Option<String>,
     /// Why some of the server's channels cannot be read.
     pub trouble: Option<String>,
-    /// The server's description of itself.
     pub info: Option<Info>,
-    /// The server's latest status.
     pub status: Option<ServerStatus>,
-    /// Numbers of lost samples.
     pub lost: Lost,
-    /// The state of the recording's player.
     pub player: Option<Player>,
 }
 
-/// Numbers of samples lost since watching began.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Lost {
     pub frames: u64,
@@ -40,7 +34,6 @@ pub struct Lost {
     pub agent: u64,
 }
 
-/// The state of a recording's player.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Player {
     pub file: String,
@@ -51,11 +44,9 @@ pub struct Player {
     pub playing: bool,
     /// Whether the end was reached. Playing then starts from the beginning.
     pub ended: bool,
-    /// Why playback ended early.
     pub error: Option<String>,
 }
 
-/// The parts of a server's description that pictures need.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Info {
     pid: u32,
@@ -72,7 +63,6 @@ pub struct Info {
     observation_colours: Option<Vec<String>>,
     /// Number of rows and columns that robots see beyond their path.
     radius: usize,
-    /// The maps of the model.
     maps: Vec<MapInfo>,
     /// For each map, a level of 0 to 255 for each cell, from its smallest to its largest factor.
     #[serde(skip)]
@@ -86,11 +76,9 @@ pub struct Info {
     publish_truth: bool,
 }
 
-/// A map of a model.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MapInfo {
     name: String,
-    /// The smallest and the largest factor.
     range: [f32; 2],
 }
 
@@ -125,7 +113,6 @@ impl MapInfo {
     }
 }
 
-/// A scene shared by many readers.
 #[derive(Debug)]
 pub struct Stage {
     scene: Mutex<Scene>,
@@ -133,7 +120,6 @@ pub struct Stage {
 }
 
 impl Scene {
-    /// Returns an empty scene with this name.
     pub fn new(instance: &str) -> Self {
         Self {
             album: Album::default(),
@@ -148,7 +134,6 @@ impl Scene {
         }
     }
 
-    /// Returns the model's states, if they are known.
     pub fn states(&self) -> Option<States> {
         let info = self.info.as_ref()?;
         Some(States {
@@ -203,7 +188,6 @@ impl Info {
 }
 
 impl Stage {
-    /// Shares a scene.
     pub fn new(scene: Scene) -> Self {
         Self {
             scene: Mutex::new(scene),
@@ -211,20 +195,17 @@ impl Stage {
         }
     }
 
-    /// Reads the scene.
     pub fn look(&self) -> MutexGuard<'_, Scene> {
         // A panic during a change can at worst leave wrong counts or pictures, and nothing relies on these.
         self.scene.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes the scene, and notifies all receivers of [`Self::changes`].
     pub fn change<T>(&self, act: impl FnOnce(&mut Scene) -> T) -> T {
         let done = act(&mut self.look());
         self.changes.send_modify(|n| *n += 1);
         done
     }
 
-    /// Returns a receiver that is notified of each change.
     pub fn changes(&self) -> watch::Receiver<u64> {
         self.changes.subscribe()
     }

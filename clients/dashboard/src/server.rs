@@ -24,7 +24,6 @@ use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
-/// Minimum time between two pictures, which allows thirty per second.
 const PICTURE_INTERVAL: Duration = Duration::from_millis(33);
 
 /// Time after which a picture is sent even if nothing has changed.
@@ -36,20 +35,16 @@ const SILENCE: Duration = Duration::from_secs(20);
 /// Number of unanswered pings after which a browser counts as gone.
 const MAX_PINGS: u32 = 3;
 
-/// Maximum size of a browser's message, in bytes.
 const MAX_ASK_BYTES: usize = 4096;
 
-/// Maximum number of browsers at a time.
 const MAX_BROWSERS: usize = 32;
 
-/// Maximum speed of a recording.
 const MAX_SPEED: f64 = 1e6;
 
 /// Content security policy: the page may load only files of this program.
 const POLICY: &str = "default-src 'self'; img-src 'self' data:; style-src 'self'; script-src 'self'; \
      connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
-/// State that every request needs.
 #[derive(Clone)]
 struct Service {
     stage: Arc<Stage>,
@@ -57,11 +52,6 @@ struct Service {
     places: Arc<Semaphore>,
 }
 
-/// Serves forever. `names` are host names, in addition to addresses and `localhost`, under which browsers may reach
-/// this server.
-///
-/// # Errors
-/// If the operating system reports an error of the listener.
 pub async fn serve(
     listener: TcpListener,
     stage: Arc<Stage>,
@@ -92,7 +82,6 @@ pub async fn serve(
     axum::serve(listener, router).await
 }
 
-/// Refuses requests from pages of other sites.
 async fn only_own_pages(State(service): State<Service>, request: Request, next: Next) -> Response {
     match access::check(request.headers(), &service.names) {
         Ok(()) => next.run(request).await,
@@ -118,7 +107,6 @@ async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Re
     })
 }
 
-/// Closes the socket of a browser for which there is no place.
 async fn close_full(mut socket: WebSocket) {
     let reason = format!("expected at most {MAX_BROWSERS} browsers at a time: close one");
     let frame = CloseFrame {
@@ -136,7 +124,6 @@ async fn close_full(mut socket: WebSocket) {
     let _ = timeout(SILENCE, ends).await;
 }
 
-/// Answers each request with one picture, until the browser leaves or sends an invalid message.
 async fn answer(mut socket: WebSocket, stage: &Stage) {
     let mut changes = stage.changes();
     let mut sent = Instant::now() - PICTURE_INTERVAL;
@@ -193,12 +180,10 @@ async fn next_message(socket: &mut WebSocket, early: &mut Option<Message>) -> Op
     None
 }
 
-/// Sends a message. Returns `None` if the browser does not accept it.
 async fn send(socket: &mut WebSocket, message: Message) -> Option<()> {
     timeout(SILENCE, socket.send(message)).await.ok()?.ok()
 }
 
-/// Passes the speed and playback wishes of a browser's request on to the recording's player.
 fn order(stage: &Stage, ask: &Ask) {
     if ask.speed.is_none() && ask.playing.is_none() {
         return;

@@ -28,7 +28,6 @@ const MANY: (usize, usize) = (FRAME_BUFFER / 3, AGENT_BUFFER / 3);
 /// How long to read at the minimum interval after a large read.
 const BUSY: Duration = Duration::from_secs(1);
 
-/// Time after which failed channels are reopened.
 const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// How long a belief waits for its frame: an agent's belief may arrive before the server's frame.
@@ -40,16 +39,10 @@ const MAX_AT_ONCE: usize = 128;
 /// Time between two status requests, and between two attempts to find a server.
 const ASK_INTERVAL: Duration = Duration::from_millis(250);
 
-/// Timeout of requests to the server.
 const ASK_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// The name of this program in a server's log.
 const CLIENT_NAME: &str = "emberwatch-dashboard";
 
-/// Starts threads that fill the stage until `stop`. Returns the threads.
-///
-/// # Errors
-/// If the frames cannot be read, for example because there are too many observers, or if a thread cannot start.
 pub fn watch(
     instance: &Instance,
     stage: &Arc<Stage>,
@@ -85,7 +78,6 @@ pub fn watch(
     Ok([reader, asker.context("start a thread")?])
 }
 
-/// Reads until `stop`. Reopens channels that fail.
 fn read(reader: Reader, instance: &Instance, stage: &Stage, stop: &AtomicBool) {
     let mut reader = Ok(reader);
     while !stop.load(Ordering::Relaxed) {
@@ -101,7 +93,6 @@ fn read(reader: Reader, instance: &Instance, stage: &Stage, stop: &AtomicBool) {
     }
 }
 
-/// Asks a server for its status until it is gone or `stop`.
 fn ask(instance: &Instance, stage: &Stage, stop: &AtomicBool) -> Result<(), ConnectionError> {
     let mut connection = Connection::open(instance, CLIENT_NAME, ASK_TIMEOUT)?;
     let info = Info::new(connection.info());
@@ -125,7 +116,6 @@ fn status(connection: &mut Connection) -> Result<ServerStatus, ConnectionError> 
     }
 }
 
-/// The subscribers to the channels.
 struct Reader {
     frames: Observer<FrameHeader>,
     truth: Option<Observer<TruthHeader>>,
@@ -173,7 +163,6 @@ impl Reader {
         Ok(())
     }
 
-    /// Reads the available samples. Returns true if there were many.
     fn look(&mut self, stage: &Stage) -> Result<bool, ChannelError> {
         // Beliefs are read first. A belief and its frame are published at about the same time, so when the frames are
         // read, the belief's frame has usually arrived.

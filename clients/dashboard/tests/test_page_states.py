@@ -2,9 +2,7 @@
 
 import os
 
-import emberwatch
-from emberwatch import OutlookReader
-from running import FAST, PATIENCE, eventually, unused_instance
+from running import eventually, unused_instance
 
 
 def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
@@ -88,40 +86,6 @@ def test_keys_pause_and_scrub_from_anywhere(watched, programs):
     look.wait_for_steps()
 
 
-def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
-    # The agent makes thousands of steps per second, because paths in a small world cost little.
-    server = programs.server(height=4, width=4, moves=2, burn_in=0)
-    look = open_page(programs.dashboard(server.instance))
-    programs.agent(server.instance, policy="random_walk", steps_per_second=FAST)
-    look.wait_for_steps()
-    look.page.keyboard.press("Space")
-    # `settled_serial` would not return: when the oldest entry is shown, its serial keeps changing.
-    at = look.picture(".shown.serial")
-    look.eventually(lambda: look.picture(".kept.first") > at, "it fell out of what is kept")
-    look.eventually(lambda: look.page.get_by_text("is no longer").is_visible(), "said so")
-    oldest = "emberwatch.picture.shown.serial - emberwatch.picture.kept.first"
-    assert look.page.evaluate(oldest) == 0, "the oldest is shown"
-
-
-def test_an_entry_without_a_belief_has_one_of_some_steps_before(programs, open_page):
-    server = programs.server(height=4, width=4, moves=2, burn_in=0)
-    look = open_page(programs.dashboard(server.instance))
-    look.eventually(lambda: look.text("state") == "serving", "serving")
-    with emberwatch.connect(server.instance) as client, OutlookReader(server.instance) as beliefs:
-        programs.agent(server.instance, steps=5)
-        while beliefs.receive(PATIENCE).step < 5:
-            pass
-        # Steps soon after the last belief, because a belief is shown only for some seconds.
-        lease = client.acquire(takeover=True)
-        for _ in range(3):
-            lease.step([0, 1])
-    look.eventually(lambda: look.picture(".series.last_step") == 8, "three steps without a belief")
-    look.page.keyboard.press("End")
-    look.eventually(lambda: look.text("step") == "8", "the last of them")
-    assert look.page.locator("[data-panel=belief-0] .hint").text_content() == "3 steps old"
-    assert look.text("objective") == "–"
-
-
 def test_a_server_that_is_killed_is_waited_for_whatever_its_grid(watched, programs):
     server, look = watched.server, watched.look
     server.kill()
@@ -143,14 +107,6 @@ def test_a_server_that_is_killed_is_waited_for_whatever_its_grid(watched, progra
     assert look.pixels("panel-truth").shape == (20, 36, 4)
     assert not look.page.get_by_text("row 23, col 31").is_visible(), "a cell that is no more"
     look.wait_for_steps()
-
-
-def test_another_agent_takes_over(watched, programs):
-    server, look = watched.server, watched.look
-    look.eventually(lambda: look.text("policy") == "beam", "the first policy")
-    programs.agent(server.instance, policy="known/shooting/explore", takeover=True)
-    look.eventually(lambda: look.text("policy") == "known/shooting/explore", "the new policy")
-    look.eventually(lambda: look.text("objective") == "entropy", "what its first path is for")
 
 
 def test_a_dashboard_that_goes_is_waited_for(watched, programs):

@@ -1,18 +1,8 @@
-"""Tests large, oblong and many worlds, slow browsers, and unpublished data."""
+"""Tests many worlds, slow browsers, and unpublished data."""
 
 import re
 
 from models import model_file
-
-
-def test_a_large_world(programs, open_page):
-    server = programs.server(height=256, width=256, moves=64, burn_in=50, publish_truth=True)
-    look = open_page(programs.dashboard(server.instance))
-    programs.agent(server.instance)
-    look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
-    look.wait_for_steps()
-    assert look.pixels("panel-truth").shape == (256, 256, 4)
-    assert look.page.evaluate("document.documentElement.scrollHeight <= innerHeight")
 
 
 def test_four_worlds(programs, open_page):

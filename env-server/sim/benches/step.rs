@@ -24,7 +24,6 @@ struct Session {
     request: StepRequest,
     /// Many random paths, because a CPU learns to predict the branches of a single path that is repeated.
     paths: Vec<Vec<u8>>,
-    /// The current step of each world.
     steps: Vec<u64>,
     body: Vec<u8>,
     payload: Vec<u8>,
@@ -82,7 +81,6 @@ impl Session {
         }
     }
 
-    /// Sends one request and returns the size of the answer's payload.
     fn step(&mut self) -> usize {
         let path = &self.paths[self.request.sequence as usize % self.paths.len()];
         self.body.clear();
@@ -99,7 +97,6 @@ impl Session {
     }
 }
 
-/// Acquires a lease on every robot and returns its token.
 fn acquire(simulator: &mut Simulator, n_robots: u32) -> u64 {
     let request = Request::Acquire {
         first_robot: 0,

@@ -20,7 +20,6 @@ use std::path::Path;
 use std::sync::Arc;
 use thiserror::Error;
 
-/// One day in milliseconds.
 const DAY: i128 = 86_400_000;
 
 settings! {
@@ -69,7 +68,6 @@ settings! {
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
-    /// The task that set the worlds' settings, if any.
     pub task: Option<Task>,
     /// The model, which has no transitions if the worlds show recorded states.
     pub model: Model,
@@ -89,7 +87,6 @@ pub struct CheckedStates {
     pub recorded: Arc<Recorded>,
 }
 
-/// An error in the settings.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConfigError {
@@ -116,10 +113,6 @@ pub enum ConfigError {
 }
 
 impl Checked {
-    /// Returns the same settings with another number of worlds.
-    ///
-    /// # Errors
-    /// If there would be too many worlds, or too many robots in all worlds.
     pub fn with_worlds(mut self, worlds: u32) -> Result<Self, ConfigError> {
         self.config.worlds = worlds;
         self.config.check_ranges()?;
@@ -144,7 +137,6 @@ impl Checked {
         )
     }
 
-    /// Describes settings that are valid, but with which robots or filters do badly.
     pub fn warnings(&self) -> Vec<String> {
         let model = &self.model;
         let mut warnings: Vec<String> = self
@@ -174,10 +166,6 @@ impl Checked {
 }
 
 impl ServerConfig {
-    /// Returns a copy of these settings with the values in `given`, whose keys are the names in `config/server.toml`.
-    ///
-    /// # Errors
-    /// If a name is unknown, a value is invalid, or a task or recorded states decide the setting.
     pub fn with(&self, given: &Map<String, Value>) -> Result<Self, ConfigError> {
         let config = self.replaced(given)?;
         if given.get("task").and_then(Value::as_str) == Some("") {
@@ -279,7 +267,6 @@ impl ServerConfig {
         Ok(())
     }
 
-    /// Reads the settings from a TOML file.
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
         let wrong = |error: &dyn Display| file_error("config file", path, error);
         let text = read_text(path).map_err(|error| wrong(&error))?;
@@ -288,7 +275,6 @@ impl ServerConfig {
         config.map_err(|error| wrong(&error))
     }
 
-    /// Reads the states file and replaces the settings that it determines.
     fn read_states(&mut self) -> Result<(Model, CheckedStates), ConfigError> {
         let file = StatesFile::named(&self.world.states)?;
         self.world = self.world.without_states();
@@ -360,6 +346,24 @@ mod tests {
         }
     }
 
+    #[test]
+    fn a_task_has_the_worlds_of_its_settings() {
+        let small = json!({"model": "wildfire-small", "height": 16, "width": 16, "moves": 16, "burn_in": 3000,
+            "max_steps": 300});
+        let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/tasks/small.toml");
+        let fingerprint = |given: Value| {
+            let checked = with(given).expect("valid").check().expect("valid");
+            let settings = crate::snapshot::Settings::of(&checked);
+            (
+                settings.worlds_fingerprint(),
+                checked.config.world.max_steps,
+            )
+        };
+        let expected = fingerprint(small);
+        assert_eq!(fingerprint(json!({"task": "small"})), expected);
+        assert_eq!(fingerprint(json!({"task": file})), expected);
+    }
+
     fn with(given: Value) -> Result<ServerConfig, String> {
         let given = given.as_object().expect("a dictionary").clone();
         let config = ServerConfig::default().with(&given);
@@ -381,7 +385,6 @@ mod tests {
         assert_eq!(with(start).map(|it| it.world.start), Ok(world.start));
     }
 
-    /// Invalid settings, and a part of the error for each.
     const WRONG: &str = r#"
 {"height": -1} => height: expected 1 to 4096, got -1
 {"height": 16.0} => height: expected 1 to 4096, got 16.0

@@ -146,10 +146,6 @@ impl Embedded {
         }))
     }
 
-    /// Returns the range of all worlds. `what` names the request in errors.
-    ///
-    /// # Errors
-    /// If the worlds were shut down, or one of them is being reset.
     fn ready_worlds(&mut self, what: &'static str) -> Result<Range<usize>, ConnectionError> {
         let worlds = self.simulator.worlds();
         match self.episodes(worlds.clone())? {
@@ -189,7 +185,6 @@ impl Embedded {
         }
     }
 
-    /// Waits until the worlds of a pending reply are ready.
     fn reset(
         &mut self,
         pending: &PendingReply,

@@ -17,10 +17,6 @@ pub fn n_threads(config: &ServerConfig) -> usize {
     }
 }
 
-/// Starts the threads of a pool.
-///
-/// # Errors
-/// If the system cannot start that many threads.
 pub fn start(pool: ThreadPoolBuilder, n_threads: usize) -> Result<ThreadPool, NoThreads> {
     let started = pool.num_threads(n_threads).build();
     let pool = started.map_err(|error| NoThreads::new(n_threads, &error))?;
@@ -47,7 +43,6 @@ pub fn check_memory(checked: &Checked, n_threads: usize) -> Result<(), NoMemory>
     memory::check(what, n_bytes)
 }
 
-/// Returns the length of the longest answer on the `step` channel, in bytes: the answer for all robots.
 pub fn answer_bytes(checked: &Checked) -> usize {
     let (config, n_cells) = (&checked.config, checked.shape.n_cells());
     config.worlds as usize * (WORLD_BYTES + config.world.robots as usize * (ROBOT_BYTES + n_cells))

@@ -4,7 +4,6 @@ use crate::world::{InvalidWorld, RobotOutcome, WorldOutcome};
 use emberwatch_messages::message::{RobotResult, WorldResult};
 use emberwatch_model::{Cell, Coverage};
 
-/// Converts a world's outcome to the result in a message.
 pub fn world_result(outcome: &WorldOutcome) -> WorldResult {
     WorldResult {
         step: outcome.step,
@@ -21,7 +20,6 @@ pub fn world_result(outcome: &WorldOutcome) -> WorldResult {
     }
 }
 
-/// Converts a robot's outcome to the result in a message.
 pub fn robot_result(outcome: &RobotOutcome) -> RobotResult {
     let (start, cell) = (outcome.start, outcome.cell);
     RobotResult {
@@ -38,10 +36,6 @@ pub fn robot_result(outcome: &RobotOutcome) -> RobotResult {
     }
 }
 
-/// Converts a world's result in a snapshot to an outcome.
-///
-/// # Errors
-/// If a flag is neither 0 nor 1.
 pub fn world_outcome(result: &WorldResult) -> Result<WorldOutcome, InvalidWorld> {
     let flag = |flag: u16| match flag {
         0 | 1 => Ok(flag == 1),
@@ -64,10 +58,6 @@ pub fn world_outcome(result: &WorldResult) -> Result<WorldOutcome, InvalidWorld>
     })
 }
 
-/// Converts a robot's result in a snapshot to an outcome.
-///
-/// # Errors
-/// If the coverage is unknown.
 pub fn robot_outcome(result: &RobotResult) -> Result<RobotOutcome, InvalidWorld> {
     let got = result.coverage;
     let coverage = Coverage::try_from(got)

@@ -18,7 +18,6 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 use zip::ZipArchive;
 
-/// Maximum size of all arrays together: 4 GiB.
 pub const MAX_BYTES: u64 = 1 << 32;
 
 /// Maximum length of an array's header. Headers written by NumPy have 128 bytes. Longer ones are refused, because many
@@ -31,7 +30,6 @@ const MAX_ZIP_END_BYTES: u64 = 22 + u16::MAX as u64;
 /// The axes of an array: K recorded steps, height H and width W.
 type Dim = (usize, usize, usize);
 
-/// Recorded hidden states and their description.
 #[derive(Debug)]
 pub struct StatesFile {
     pub description: Description,
@@ -41,7 +39,6 @@ pub struct StatesFile {
     pub sequences: Sequences,
 }
 
-/// Recorded sequences of hidden states on the same grid.
 #[derive(Debug, Default)]
 pub struct Sequences {
     /// Each has shape `[K, H, W]`, row-major, with K at least 2.
@@ -51,7 +48,6 @@ pub struct Sequences {
     checksum: crc32fast::Hasher,
 }
 
-/// An error in a states file.
 #[derive(Debug, Error)]
 #[error("states file {}: {problem}", shortened(path))]
 pub struct StatesError {
@@ -102,12 +98,10 @@ impl Sequences {
         }
     }
 
-    /// Returns the CRC-32 of all shapes and values, in order.
     pub fn checksum(&self) -> u32 {
         self.checksum.clone().finalize()
     }
 
-    /// Adds the arrays of a `.npz` archive, sorted by name.
     pub fn add_archive(&mut self, mut archive: impl Read + Seek) -> Result<(), String> {
         let n_entries = n_entries(&mut archive).map_err(|error| error.to_string())?;
         let unfit = |error| {
@@ -272,7 +266,6 @@ fn described(text: &str) -> anyhow::Result<(Description, Model)> {
     Ok((description, model))
 }
 
-/// Returns the arrays and archives in a folder, sorted by name.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
     let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
     let paths: Result<Vec<PathBuf>, _> = entries
@@ -332,7 +325,6 @@ fn is_archive(path: &Path) -> bool {
     path.extension() == Some(OsStr::new("npz"))
 }
 
-/// Strips the `.npy` ending from the name of an archive's member.
 fn bare(name: &str) -> &str {
     name.strip_suffix(".npy").unwrap_or(name)
 }

@@ -31,7 +31,6 @@ pub struct RecordCommand {
 }
 
 impl RecordCommand {
-    /// Records until stopped or until the requested number of steps is reached.
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
         let options = RecordOptions {

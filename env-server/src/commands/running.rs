@@ -9,7 +9,6 @@ use emberwatch_protocol::program::print;
 use serde::Serialize;
 use std::time::Duration;
 
-/// How long to wait for the server's answer.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Prints the state of a running server.
@@ -30,7 +29,6 @@ pub struct StopCommand {
     instance: String,
 }
 
-/// The answer to `status`, together with the name of the task that defines the worlds, if any.
 #[derive(Serialize)]
 struct NamedStatus<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -40,7 +38,6 @@ struct NamedStatus<'a> {
 }
 
 impl StatusCommand {
-    /// Prints the server's status as text or JSON.
     pub fn run(&self) -> Result<()> {
         let (info, reply) = self.target.ask(&Request::Status {})?;
         match reply {
@@ -56,7 +53,6 @@ impl StatusCommand {
 }
 
 impl StopCommand {
-    /// Asks the server to stop, and waits for its confirmation.
     pub fn run(&self) -> Result<()> {
         self.ask(&Request::Shutdown {}).map(drop)
     }

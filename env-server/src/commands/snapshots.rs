@@ -67,7 +67,6 @@ pub struct ForkCommand {
 }
 
 impl SnapshotCommand {
-    /// Asks the server to write the file.
     pub fn run(&self) -> Result<()> {
         let mut server = connect(&self.instance)?;
         let rest = server.info().n_worlds.saturating_sub(self.first_world);
@@ -92,7 +91,6 @@ impl SnapshotCommand {
 }
 
 impl RestoreCommand {
-    /// Acquires the robots of the worlds, lets the server replace the worlds, and releases the robots.
     pub fn run(&self) -> Result<()> {
         // Reads the file first, so that a wrong file is refused before any robot is taken over.
         let in_file = read(&self.file)?.worlds.len() as u32;
@@ -120,7 +118,6 @@ impl RestoreCommand {
 }
 
 impl ForkCommand {
-    /// Acquires the robots of the world, lets the server replace the world, and releases the robots.
     pub fn run(&self) -> Result<()> {
         let (from, to) = (self.from, self.to);
         replace(

@@ -20,15 +20,12 @@ use std::time::{Duration, Instant};
 /// steps.
 const SYNC_INTERVAL: Duration = Duration::from_secs(5);
 
-/// The schedule and the folder of automatic snapshots.
 pub struct Autosave {
     folder: Folder,
     keep: usize,
-    /// Number of world steps between two snapshots.
     every: u64,
     /// Total number of world steps at which the next snapshot is due.
     due: u64,
-    /// The job that is currently writing a snapshot.
     writing: Option<(u64, Durability)>,
     /// The latest snapshot that survives a loss of power, and when it was written.
     safe: Option<(Instant, PathBuf)>,
@@ -36,10 +33,6 @@ pub struct Autosave {
 }
 
 impl Autosave {
-    /// Prepares automatic snapshots, or returns `None` if the settings do not enable them.
-    ///
-    /// # Errors
-    /// If the folder is not writable, or contains snapshots of an earlier run although `restore` is not set.
     pub fn new(checked: &Checked) -> Result<Option<Self>, FileError> {
         let config = &checked.config;
         if config.snapshot_every == 0 {
@@ -69,7 +62,6 @@ impl Autosave {
         n_steps >= self.due && self.writing.is_none()
     }
 
-    /// Skips the snapshot that is due.
     pub fn skip(&mut self, n_steps: u64) {
         self.due = n_steps.saturating_add(self.every);
     }
@@ -89,7 +81,6 @@ impl Autosave {
         self.writing = Some((job, durability));
     }
 
-    /// Handles the result of a file job. Returns whether the job was an automatic snapshot.
     pub fn finish(&mut self, job: u64, outcome: &Result<Done, FileError>) -> bool {
         let Some((_, durability)) = self.writing.take_if(|(own, _)| *own == job) else {
             return false;
@@ -104,7 +95,6 @@ impl Autosave {
         true
     }
 
-    /// Warns, at most every ten seconds, that a snapshot was not written.
     pub fn warn(&mut self, error: &dyn Display) {
         if let Some(n_unsaid) = self.failures.pass(Instant::now()) {
             tracing::warn!(n_unsaid, "no snapshot was written: {error}");
@@ -121,9 +111,7 @@ fn durability(age: Option<Duration>, is_last: bool) -> Durability {
     }
 }
 
-/// The saved worlds that a server starts with.
 pub struct FirstWorlds {
-    /// The snapshot file.
     pub path: PathBuf,
     pub worlds: Vec<SnapshotWorld<Box<Episode>>>,
 }

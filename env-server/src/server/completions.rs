@@ -6,23 +6,17 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
-/// The receiving end of the channel.
 pub struct Completions<T> {
     pub results: Receiver<T>,
     /// A descriptor that is readable if `results` may contain something.
     signal: Arc<OwnedFd>,
 }
 
-/// The sending end of the channel, for use in another thread.
 pub struct CompletionSender<T> {
     results: Sender<T>,
     signal: Arc<OwnedFd>,
 }
 
-/// Creates both ends.
-///
-/// # Errors
-/// If the system has no file descriptor left.
 pub fn completions<T>() -> Result<(CompletionSender<T>, Completions<T>), ChannelError> {
     let signal = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
     let signal = Arc::new(signal.map_err(|errno| call_error("eventfd2", errno))?);
@@ -52,7 +46,6 @@ impl<T> Clone for CompletionSender<T> {
 }
 
 impl<T> Completions<T> {
-    /// Returns the results since the last call.
     pub fn take(&self) -> Vec<T> {
         let _ = rustix::io::read(&*self.signal, &mut [0u8; 8]);
         self.results.try_iter().collect()

@@ -10,7 +10,6 @@ use thiserror::Error;
 /// of 16 observers and 4 readers of hidden states 1.
 const NEEDED: u64 = 512;
 
-/// The error for a limit that is too low for all clients and observers.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error(
     "file descriptors: expected a limit of at least {NEEDED}, got {got}; raise it (`ulimit -Hn`; docker: --ulimit \
@@ -20,7 +19,6 @@ pub struct TooFewDescriptors {
     got: u64,
 }
 
-/// Raises the soft limit on file descriptors if it is too low.
 pub fn raise_limit() -> Result<(), TooFewDescriptors> {
     let Some(raised) = enough(getrlimit(Resource::Nofile))? else {
         return Ok(());

@@ -10,10 +10,8 @@ use std::time::{Duration, Instant};
 /// Maximum number of unfinished jobs.
 const MAX_JOBS: u64 = 16;
 
-/// A job's number and result.
 pub type FileResult = (u64, Result<Done, FileError>);
 
-/// The thread that runs file jobs, and its queue.
 pub struct Files {
     jobs: Option<Sender<(u64, Job)>>,
     n_jobs: u64,
@@ -22,10 +20,6 @@ pub struct Files {
 }
 
 impl Files {
-    /// Starts the thread.
-    ///
-    /// # Errors
-    /// If the system has no file descriptor left or cannot start a thread.
     pub fn start(spec: WorldSpec) -> anyhow::Result<Self> {
         let (sender, finished) = completions()?;
         let (jobs, queue) = channel::<(u64, Job)>();
@@ -43,7 +37,6 @@ impl Files {
         })
     }
 
-    /// Queues a job and returns its number.
     pub fn add(&mut self, job: Job) -> u64 {
         self.n_jobs += 1;
         if let Some(jobs) = &self.jobs {
@@ -58,7 +51,6 @@ impl Files {
         self.n_jobs - self.n_done < MAX_JOBS
     }
 
-    /// Returns the jobs finished since the last call.
     pub fn finished(&mut self) -> Vec<FileResult> {
         let finished = self.finished.take();
         self.n_done += finished.len() as u64;

@@ -28,7 +28,6 @@ pub struct Clients {
 }
 
 impl Clients {
-    /// Returns the process of a node, and starts to watch the process.
     pub fn identify(&mut self, node: u128) -> ClientId {
         if let Some(&pid) = self.nodes.get(&node) {
             return ClientId { node, pid };

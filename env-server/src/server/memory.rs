@@ -21,7 +21,6 @@ const FIXED_BYTES: u64 = 8 << 20;
 /// borrowed and one loaned).
 const ANSWERS: usize = 2 * 3;
 
-/// The shared memory for the messages of a server's ports.
 pub struct PortMemory {
     control: MessageMemory,
     step: MessageMemory,
@@ -29,7 +28,6 @@ pub struct PortMemory {
     truth: Option<MessageMemory>,
 }
 
-/// The ids of a server's ports.
 pub struct PortIds {
     pub control: u128,
     pub step: u128,
@@ -38,7 +36,6 @@ pub struct PortIds {
 }
 
 impl PortMemory {
-    /// Creates the memory of these ports and prepares it for a first client.
     pub fn new(ids: &PortIds, config: &PortConfig) -> Result<Self, ChannelError> {
         let n_answers = MAX_CLIENTS * ANSWERS;
         let truth = ids.truth.map(|id| {
@@ -56,18 +53,15 @@ impl PortMemory {
         Ok(memory)
     }
 
-    /// Allocates the memory for answers to `n_clients` clients.
     pub fn for_clients(&self, n_clients: usize) -> Result<(), ChannelError> {
         self.control.make_ready(n_clients * ANSWERS)?;
         self.step.make_ready(n_clients * ANSWERS)
     }
 
-    /// Allocates the memory for frames to `n_observers` observers.
     pub fn for_observers(&self, n_observers: usize) -> Result<(), ChannelError> {
         self.frames.make_ready(samples(n_observers, FRAME_BUFFER))
     }
 
-    /// Allocates the memory for hidden states to `n_readers` readers.
     pub fn for_readers(&self, n_readers: usize) -> Result<(), ChannelError> {
         let n_truths = samples(n_readers, TRUTH_BUFFER);
         self.truth
@@ -82,7 +76,6 @@ fn samples(n_subscribers: usize, buffer: usize) -> usize {
     n_subscribers * (buffer + 1) + 2
 }
 
-/// Checks that `/dev/shm` has enough space for the maximum number of clients and observers.
 pub fn check_shared_memory(config: &PortConfig) -> Result<()> {
     let bytes =
         |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;

@@ -19,7 +19,6 @@ impl Server {
         }
     }
 
-    /// Starts a file job for a request, which is answered when the job is done.
     pub(super) fn start_file(
         &mut self,
         now: Instant,

@@ -42,7 +42,6 @@ use std::time::Instant;
 /// A received request on `step` that is not answered yet.
 pub type ActiveStep = Active<StepRequest, StepReply>;
 
-/// All ports of a server.
 pub struct Ports {
     step: StepServer,
     control: ControlServer,
@@ -71,10 +70,6 @@ impl Drop for Ports {
 }
 
 impl Ports {
-    /// Opens the ports for worlds with these settings.
-    ///
-    /// # Errors
-    /// If another server runs the instance, or the system has too little memory or too few descriptors.
     pub fn open(checked: &Checked) -> Result<Self> {
         let (n_cells, config) = (checked.shape.n_cells(), &checked.config);
         let of_robots = config.world.robots as usize * (ROBOT_BYTES + n_cells);
@@ -107,9 +102,10 @@ impl Ports {
         let frame_service = services.frames()?;
         let frames = publisher(&frame_service, config.frame_bytes, &failed)?;
         let truth_service = config.publish_truth.then(|| services.truth()).transpose()?;
-        let truth = truth_service.as_ref();
-        let truth = truth.map(|service| publisher(service, config.n_cells, &failed));
-        let truth = truth.transpose()?;
+        let truth = truth_service
+            .as_ref()
+            .map(|service| publisher(service, config.n_cells, &failed))
+            .transpose()?;
         let listener = services.listener(Channel::WakeServer)?;
         let answers = Answers::new(&services)?;
         fill_ports(&node, false)?;
@@ -154,12 +150,10 @@ impl Ports {
         }
     }
 
-    /// Returns the next step request, if any.
     pub fn receive_step(&self) -> Option<ActiveStep> {
         received(self.step.receive(), &self.failed_connections)
     }
 
-    /// Returns the next control request, if any.
     pub fn receive_control(&self) -> Option<ActiveControl> {
         received(self.control.receive(), &self.failed_connections)
     }
@@ -177,12 +171,10 @@ impl Ports {
         }
     }
 
-    /// Returns the sender of answers to step and control requests.
     pub fn answers(&mut self) -> &mut Answers {
         &mut self.answers
     }
 
-    /// Publishes a step of a world to the observers.
     pub fn publish_frame(&self, header: FrameHeader, bytes: &[u8]) {
         let (n_observers, _) = self.observers();
         let ready = self.memory.for_observers(n_observers);
@@ -201,7 +193,6 @@ impl Ports {
         self.warn_of(sent, "hidden states were not published");
     }
 
-    /// Warns, at most every ten seconds, about a sample that was not published.
     fn warn_of(&self, sent: Result<usize, String>, what: &str) {
         if let Err(problem) = sent
             && let Some(n_unsaid) = self.unpublished.borrow_mut().pass(Instant::now())
@@ -210,12 +201,10 @@ impl Ports {
         }
     }
 
-    /// Warns, at most every ten seconds, about clients and observers that cannot connect.
     pub fn warn_of_descriptors(&self, now: Instant) {
         self.failed_connections.warn(now);
     }
 
-    /// Returns the number of observers of frames and of readers of hidden states.
     pub fn observers(&self) -> (usize, usize) {
         let n_frames = self.frame_service.dynamic_config().number_of_subscribers();
         let n_truth = self.truth_service.as_ref().map_or(0, |service| {
@@ -224,7 +213,6 @@ impl Ports {
         (n_frames, n_truth)
     }
 
-    /// Returns the port ids of the observers of frames and readers of hidden states.
     pub fn observer_ids(&self) -> Vec<u128> {
         self.list_observers(|observer| observer.subscriber_id.value())
     }
@@ -261,12 +249,10 @@ impl Ports {
             .map(UpdateConnections::update_connections);
     }
 
-    /// Returns the number of clients connected to `step`.
     pub fn n_clients(&self) -> usize {
         self.step_service.dynamic_config().number_of_clients()
     }
 
-    /// Returns the nodes of clients with an open connection.
     pub fn client_nodes(&self) -> HashSet<u128> {
         let mut nodes = HashSet::new();
         let mut add = |client: &ClientDetails| {

@@ -8,7 +8,6 @@ use emberwatch_sim::simulator::Simulator;
 use emberwatch_sim::world::Episode;
 use std::ops::Range;
 
-/// The known observers, and the numbers of samples published so far.
 #[derive(Default)]
 pub struct Publications {
     observers: Vec<u128>,
@@ -20,12 +19,10 @@ pub struct Publications {
 }
 
 impl Publications {
-    /// Returns whether some worlds must still be published for new observers.
     pub fn has_new_observers(&self) -> bool {
         !self.for_new.is_empty()
     }
 
-    /// Publishes the next batch of worlds for new observers, if some are left.
     pub fn publish_to_new(&mut self, ports: &Ports, simulator: &Simulator) {
         let observers = ports.observer_ids();
         let has_new = observers.iter().any(|id| !self.observers.contains(id));

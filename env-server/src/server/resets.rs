@@ -8,7 +8,6 @@ use rayon::ThreadPool;
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 
-/// The threads that reset worlds, and the finished resets.
 pub struct Resets {
     threads: ThreadPool,
     rules: Arc<Rules>,
@@ -17,10 +16,6 @@ pub struct Resets {
 }
 
 impl Resets {
-    /// Prepares the threads for resets.
-    ///
-    /// # Errors
-    /// If the system has no file descriptor left.
     pub fn new(threads: ThreadPool, rules: Rules) -> Result<Self, ChannelError> {
         let (sender, finished) = completions()?;
         Ok(Self {
@@ -38,7 +33,6 @@ impl Resets {
         }
     }
 
-    /// Returns the worlds whose reset has finished since the last call.
     pub fn finished(&self) -> Vec<(usize, Box<Episode>)> {
         self.finished.take()
     }

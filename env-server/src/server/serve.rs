@@ -30,7 +30,6 @@ const CONTROL_FIRST: u64 = 64;
 /// How often a server publishes the next batch of worlds for new observers.
 const NEW_OBSERVER_TICK: Duration = Duration::from_millis(5);
 
-/// Serves until `stop` is set, a client requests a shutdown, or the process `exit_with` ends.
 pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -> Result<()> {
     let mut server = Server::start(checked, exit_with)?;
     let mut outcome = Ok(());
@@ -44,7 +43,6 @@ pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -
     Ok(())
 }
 
-/// The event that ended the wait in one round of the main loop.
 enum Found {
     Step(ActiveStep),
     Control(ActiveControl),
@@ -53,7 +51,6 @@ enum Found {
 }
 
 impl Server {
-    /// Waits for a request or another event and handles it.
     fn run_once(&mut self) -> Result<()> {
         let woken = Cell::new(false);
         let tick = if self.publications.has_new_observers() {
@@ -160,7 +157,6 @@ impl Server {
         }
     }
 
-    /// Sends an answer whose body is in `self.payload`.
     fn send_step(&mut self, now: Instant, request: &ActiveStep, mut reply: StepReply) {
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
         let header = request.user_header().0;
@@ -206,7 +202,6 @@ impl Server {
         self.answer_settled(now);
     }
 
-    /// Does the regular work: handles ended clients, finished jobs, expired leases and new observers.
     fn check_everything(&mut self, now: Instant) -> Result<()> {
         self.last_tick = now;
         self.cancel_abandoned(now);

@@ -12,10 +12,8 @@ use thiserror::Error;
 /// How long to retry while a dead process owns the instance.
 const LIMIT: Duration = Duration::from_secs(10);
 
-/// Pause between two attempts.
 const INTERVAL: Duration = Duration::from_millis(100);
 
-/// The error for an instance that another server already runs.
 #[derive(Debug, Error)]
 #[error("instance {instance:?} is already running, as pid {pid}")]
 pub struct Taken {

@@ -15,30 +15,23 @@ pub const MAX_INTENT_BYTES: usize = 65_536;
 /// The policy, estimator and objective behind an agent's last path.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Intent {
-    /// Name of the agent's policy.
     pub policy: String,
     /// The estimator that computed the belief.
     pub belief_from: String,
-    /// The objective of the last path that was flown.
     pub objective: String,
-    /// Names of the belief's states.
     pub states: Vec<String>,
-    /// Time taken to plan the path, in milliseconds.
     pub plan_millis: f64,
 }
 
 /// A checked sample of the channel `agent`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AgentBelief {
-    /// The header, which contains the world, episode, step and process.
     pub header: AgentHeader,
     /// The posterior belief about the state at that step, shape `[S, H, W]`, each value in 0..=1.
     pub belief: Probabilities,
-    /// The policy, estimator and objective of the path.
     pub intent: Intent,
 }
 
-/// The error for a malformed sample.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("sample of an agent: {problem}")]
 pub struct BeliefError {

@@ -13,7 +13,6 @@ pub type StepAnswer = (StepReply, Vec<u8>);
 
 /// A server, or worlds in this process.
 pub trait Backend {
-    /// Returns the server's settings.
     fn info(&self) -> &ServerInfo;
 
     /// Answers a step request. Fills in the request's version, sequence number and listener, if the backend is a
@@ -34,10 +33,6 @@ pub trait Backend {
     /// The same as [`Self::step`].
     fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError>;
 
-    /// Answers a control request.
-    ///
-    /// # Errors
-    /// The same as [`Self::step`].
     fn control(&mut self, request: &Request, timeout: Duration) -> Result<Reply, ConnectionError> {
         let text = serde_json::to_vec(request).expect("invariant: requests serialise");
         let answer = self.control_text(&text, timeout)?;

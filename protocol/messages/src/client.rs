@@ -64,7 +64,6 @@ impl<B: Backend> Client<B> {
         self.shares_frames = shares;
     }
 
-    /// Returns the server's settings.
     pub fn info(&self) -> &ServerInfo {
         self.backend.info()
     }
@@ -104,17 +103,14 @@ impl<B: Backend> Client<B> {
         Ok(left.map(|left| left.bytes))
     }
 
-    /// Returns the height and width of the grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
-    /// Returns the numbers of the client's robots.
     pub fn robots(&self) -> Range<u32> {
         self.robots.clone()
     }
 
-    /// Returns the worlds to which these robots belong.
     pub fn worlds_of(&self, robots: &Range<u32>) -> Range<u32> {
         worlds_of(robots.start, robots.len() as u32, self.info().n_robots)
     }

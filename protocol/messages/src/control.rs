@@ -10,20 +10,17 @@ pub use super::json::{MAX_CONTROL_BYTES, parse};
 /// Maximum size of a part of a belief in one message, in bytes before the base64 encoding.
 pub const MAX_BELIEF_PART: usize = 1 << 19;
 
-/// A request on the control channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
     /// Start the handshake: ask for the server's settings and protocol version.
     Hello {
-        /// The client's protocol version.
         protocol: u32,
         /// The client's name and version, for the server's log.
         client: String,
     },
     /// Acquire the right to fly consecutive robots.
     Acquire {
-        /// Number of the first robot.
         first_robot: u32,
         /// Number of robots, at least 1.
         n_robots: u32,
@@ -35,26 +32,14 @@ pub enum Request {
         ttl_millis: Option<u64>,
     },
     /// Extend a lease without flying.
-    Renew {
-        /// The lease.
-        lease: u64,
-    },
+    Renew { lease: u64 },
     /// Return the robots of a lease.
-    Release {
-        /// The lease.
-        lease: u64,
-    },
+    Release { lease: u64 },
     /// Start new episodes; the answer is sent when the burn-in is done. The client needs a lease on at least one robot
     /// of these worlds, and no other client may hold any of their robots. The same applies to `Restore` and `Fork`.
-    Reset {
-        /// The lease.
-        lease: u64,
-        /// The worlds and their seeds.
-        worlds: Vec<WorldSeed>,
-    },
+    Reset { lease: u64, worlds: Vec<WorldSeed> },
     /// Write worlds to a file on the server's machine.
     Snapshot {
-        /// First world.
         first_world: u32,
         /// Number of worlds, at least 1.
         n_worlds: u32,
@@ -63,9 +48,7 @@ pub enum Request {
     },
     /// Replace worlds of the lease with worlds from a snapshot file.
     Restore {
-        /// The lease.
         lease: u64,
-        /// First world.
         first_world: u32,
         /// Number of worlds, at least 1.
         n_worlds: u32,
@@ -76,21 +59,12 @@ pub enum Request {
         path: String,
     },
     /// Replace a world of the lease with a copy of another world.
-    Fork {
-        /// The lease on the replaced world.
-        lease: u64,
-        /// The world to copy.
-        from: u32,
-        /// The world to replace.
-        to: u32,
-    },
+    Fork { lease: u64, from: u32, to: u32 },
     /// Store the next part of a belief about a robot's world, for the next client that flies the robot.
     LeaveBelief(LeftPart),
     /// Load the belief that was stored for a robot, if it is about the current step of the robot's world.
     Belief {
-        /// Number of the robot.
         robot: u32,
-        /// The offset of the requested part.
         #[serde(default)]
         offset: u64,
     },
@@ -101,18 +75,15 @@ pub enum Request {
     Shutdown {},
 }
 
-/// A world to reset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorldSeed {
-    /// The world.
     pub world: u32,
     /// The new seed; `None` lets the server derive one from the previous seed.
     #[serde(default)]
     pub seed: Option<u64>,
 }
 
-/// A reply of the server.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "reply", rename_all = "snake_case")]
 pub enum Reply {
@@ -129,9 +100,7 @@ pub enum Reply {
     },
     /// Answers `snapshot`: the file was written.
     Snapshot {
-        /// The file.
         path: String,
-        /// The length of the file in bytes.
         n_bytes: u64,
         /// The worlds in the file, at the steps that the file contains.
         worlds: Vec<WorldInfo>,
@@ -143,23 +112,17 @@ pub enum Reply {
     },
     /// Answers `belief`.
     Belief {
-        /// Kind of the belief, and the step to which it belongs.
         #[serde(flatten)]
         info: BeliefInfo,
-        /// The offset of the part.
         offset: u64,
         /// The part in base64; empty at the end of the belief.
         data: String,
     },
-    /// Answers `status`.
     Status(ServerStatus),
     /// Reports that a request was refused; nothing was changed.
     Error {
-        /// The status code.
         status: Status,
-        /// The detail of the status; see [`Status`].
         detail: u64,
-        /// The reason in words.
         message: String,
     },
 }
@@ -173,7 +136,6 @@ pub struct LeaseInfo {
     pub ttl_millis: u64,
     /// Numbers of the robots that the lease still holds.
     pub robots: Vec<u32>,
-    /// The worlds of these robots.
     pub worlds: Vec<WorldInfo>,
 }
 
@@ -181,13 +143,9 @@ pub struct LeaseInfo {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LeftPart {
-    /// The lease.
     pub lease: u64,
-    /// Number of the robot.
     pub robot: u32,
-    /// The episode.
     pub episode: u64,
-    /// The current step of the world.
     pub step: u64,
     /// The format of the bytes, in at most 256 bytes.
     pub kind: String,
@@ -202,26 +160,20 @@ pub struct LeftPart {
 /// A belief that was stored for a robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BeliefInfo {
-    /// The format of the bytes.
     pub kind: String,
-    /// Seed of the episode that the belief is about.
     pub seed: u64,
-    /// The episode that the belief is about.
     pub episode: u64,
     /// The step at which the belief was stored.
     pub step: u64,
-    /// Length of the belief in bytes.
     pub length: u64,
 }
 
 /// The current episode and step of a world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WorldInfo {
-    /// The world.
     pub world: u32,
     /// Step index k.
     pub step: u64,
-    /// Seed of the episode.
     pub seed: u64,
     /// The episode: the number of resets of the world since the server started.
     pub episode: u64,
@@ -229,38 +181,28 @@ pub struct WorldInfo {
     pub robots: Vec<[u32; 2]>,
 }
 
-/// The answer to `status`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ServerStatus {
-    /// The server's process.
     pub pid: u32,
-    /// Time since the server started.
     pub uptime_millis: u64,
     /// Number of world steps since the server started, over all worlds.
     pub n_steps: u64,
     /// World steps per second, over about the last second.
     pub steps_per_second: f64,
-    /// Number of refused requests since the server started.
     pub n_refused: u64,
-    /// Number of clients connected to the step channel.
     pub n_clients: usize,
-    /// Number of observers of the frames channel.
     pub n_observers: usize,
-    /// The status of each world.
     pub worlds: Vec<WorldStatus>,
 }
 
-/// The status of one world in the answer to `status`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WorldStatus {
-    /// The world's episode and step.
     #[serde(flatten)]
     pub info: WorldInfo,
     /// The pid of the client that holds each robot, if any.
     pub holder_pids: Vec<Option<u32>>,
     /// Number of robots that have a path for the next step.
     pub n_paths: u32,
-    /// Whether the world is being reset.
     pub resetting: bool,
 }
 
@@ -270,7 +212,6 @@ impl Reply {
         Self::error(status, detail, status.explain(detail))
     }
 
-    /// Returns a refusal with a specific message.
     pub fn error(status: Status, detail: u64, message: String) -> Self {
         Self::Error {
             status,
@@ -279,13 +220,11 @@ impl Reply {
         }
     }
 
-    /// Returns the refusal for a client that speaks another protocol version.
     pub fn version_mismatch(client: u32) -> Self {
         let (status, detail) = (Status::VersionMismatch, u64::from(VERSION));
         Self::error(status, detail, Status::version_mismatch(client, detail))
     }
 
-    /// Returns the status for the binary header.
     pub fn status(&self) -> Status {
         match self {
             Self::Error { status, .. } => *status,

@@ -11,39 +11,27 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ChannelError {
-    /// The name of an instance is invalid.
     #[error(
         "instance name: expected 1 to 64 letters, digits, '-' or '_', got {:?}",
         shortened(_0)
     )]
     InstanceName(String),
-    /// The directory for the channels' files cannot be used.
     #[error("channel directory {path}: {problem}")]
-    Directory {
-        /// The directory, or the file in it.
-        path: String,
-        /// What was expected and what was found.
-        problem: String,
-    },
+    Directory { path: String, problem: String },
     /// Another process held the lock of the channels' directory for too long.
     #[error(
         "channel directory {path}: expected the lock within {limit:?}, but it is still held by {holder}"
     )]
     Locked {
-        /// The lock file.
         path: String,
-        /// How long the process waited for the lock.
         limit: Duration,
-        /// The process that holds the lock.
         holder: String,
     },
-    /// No server runs on the instance.
     #[error(
         "no server on instance {instance:?}: start one with `emberwatch-server --instance {instance}`{}",
         .others.as_ref().map(|others| format!("; {others}")).unwrap_or_default()
     )]
     NoServer {
-        /// Name of the instance.
         instance: String,
         /// A hint at servers of other users, which cannot be reached.
         others: Option<String>,
@@ -54,64 +42,42 @@ pub enum ChannelError {
          process on every system",
         std::env::consts::OS
     )]
-    OtherSystem {
-        /// Name of the instance.
-        instance: String,
-    },
-    /// A server runs on the instance, but it speaks another version of the protocol.
+    OtherSystem { instance: String },
     #[error("{}", Status::version_mismatch(VERSION, u64::from(*.version)))]
-    OtherVersion {
-        /// The server's protocol version.
-        version: u32,
-    },
+    OtherVersion { version: u32 },
     /// The server is in another PID namespace, where process ids refer to other processes.
     #[error(
         "instance {instance:?} is served from another PID namespace: run both programs in one (docker: \
          --pid=container:NAME; Kubernetes: shareProcessNamespace: true), or give each container a separate /dev/shm \
          (docker: --ipc=private)"
     )]
-    OtherPidNamespace {
-        /// Name of the instance.
-        instance: String,
-    },
-    /// There is too little shared memory.
+    OtherPidNamespace { instance: String },
     #[error("shared memory: {problem}")]
     NoRoom {
         /// What was expected, what is available, and what to do.
         problem: String,
     },
-    /// The channel already has its maximum number of users.
     #[error("{what}: expected at most {most} at a time, got one more")]
     NoPlace {
-        /// The attempted operation.
         what: &'static str,
         /// The maximum number, with its unit.
         most: &'static str,
     },
-    /// The process cannot open more files.
     #[error(
         "{what}: expected {needed} free file descriptors, got fewer (the limit is {limit}); close some, or raise the limit \
          (`ulimit -n`; docker: --ulimit nofile)"
     )]
     NoDescriptors {
-        /// The attempted operation.
         what: &'static str,
         /// Number of file descriptors that the operation needs.
         needed: usize,
-        /// Maximum number of file descriptors of the process.
         limit: String,
     },
-    /// The system refuses a call that channels need, for example because of a container's seccomp profile.
     #[error(
         "{call}: expected the system to allow this call, got: {problem}; allow it in the seccomp profile of the container \
          (docker: --security-opt seccomp=PROFILE), or use a newer kernel if it lacks the call"
     )]
-    RefusedCall {
-        /// The system call.
-        call: &'static str,
-        /// The system's error.
-        problem: String,
-    },
+    RefusedCall { call: &'static str, problem: String },
     /// The check set with [`crate::interrupt::interrupt_when`] ended a wait.
     #[error("interrupted")]
     Interrupted,
@@ -121,14 +87,8 @@ pub enum ChannelError {
          close them first, or use one process for each copy"
     )]
     AnotherCopy,
-    /// iceoryx2 returned an error.
     #[error("{what}: iceoryx2 reports {problem}")]
-    Ipc {
-        /// The attempted operation.
-        what: &'static str,
-        /// The error of iceoryx2.
-        problem: String,
-    },
+    Ipc { what: &'static str, problem: String },
 }
 
 /// The reason why a request failed.
@@ -143,46 +103,27 @@ pub enum ConnectionError {
     Memory(#[from] NoMemory),
     /// The server ended before or during the request.
     #[error("the server on instance {instance:?} is gone")]
-    ServerGone {
-        /// Name of the instance.
-        instance: String,
-    },
+    ServerGone { instance: String },
     /// No answer came in time. The step may still have been taken, so observe the worlds before the next step.
     #[error("no answer to {what} from instance {instance:?} within {timeout:.1?}")]
     Timeout {
-        /// Kind of the request.
         what: &'static str,
-        /// Name of the instance.
         instance: String,
-        /// How long the client waited.
         timeout: Duration,
     },
     /// The server refused the request, and changed nothing.
     #[error("{message}")]
     Refused {
-        /// The status code.
         status: Status,
-        /// The detail of the status; see [`Status`].
         detail: u64,
-        /// The reason in words.
         message: String,
     },
     /// The request applies only to worlds in this process, or cannot be met by them now. Nothing has changed.
     #[error("{what}: {problem}")]
-    NotHere {
-        /// Name of the request.
-        what: &'static str,
-        /// What was expected and what was given.
-        problem: String,
-    },
+    NotHere { what: &'static str, problem: String },
     /// The answer is invalid, because the client and the server are different releases.
     #[error("answer to {what}: {problem}")]
-    Garbled {
-        /// Kind of the request.
-        what: &'static str,
-        /// The error in the answer.
-        problem: String,
-    },
+    Garbled { what: &'static str, problem: String },
 }
 
 /// What a caller can do about an error. Clients in other languages have one exception or code for each; the numbers are
@@ -215,7 +156,6 @@ pub enum ErrorClass {
 }
 
 impl ConnectionError {
-    /// Returns the class of the error.
     pub fn class(&self) -> ErrorClass {
         match self {
             Self::Channel(channel) => channel.class(),
@@ -297,7 +237,6 @@ pub fn check_answer(
     Err(garbled(what, problem))
 }
 
-/// Returns the error of a request that is refused with this status and detail.
 pub fn refused(status: Status, detail: u64) -> ConnectionError {
     ConnectionError::Refused {
         status,
@@ -306,7 +245,6 @@ pub fn refused(status: Status, detail: u64) -> ConnectionError {
     }
 }
 
-/// Returns the error for an invalid answer.
 pub fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
     ConnectionError::Garbled {
         what,
@@ -314,7 +252,6 @@ pub fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
     }
 }
 
-/// Returns the error for a reply to another kind of request.
 pub fn unexpected(what: &'static str, reply: &impl Debug) -> ConnectionError {
     garbled(what, format!("expected the matching reply, got {reply:?}"))
 }

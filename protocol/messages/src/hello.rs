@@ -8,11 +8,8 @@ use std::sync::Arc;
 /// The settings of a server: everything that a client needs to know to fly robots.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ServerInfo {
-    /// The server's protocol version.
     pub protocol: u32,
-    /// The server's release.
     pub build: String,
-    /// The server's process id.
     pub pid: u32,
     /// The number of the PID namespace to which `pid` belongs, on Linux. A client can watch the process only from
     /// within this namespace.
@@ -22,19 +19,15 @@ pub struct ServerInfo {
     pub height: usize,
     /// Grid width W.
     pub width: usize,
-    /// Number of moves in a path.
     pub n_moves: usize,
-    /// Number of worlds.
     pub n_worlds: u32,
     /// Number of robots R of each world.
     pub n_robots: u32,
     /// Number of observations O. The values in frames are below O, or 255 for unobserved cells.
     pub n_observations: usize,
-    /// Names of the observations.
     pub observations: Vec<String>,
     /// The model as TOML, if there is one and the server reveals it.
     pub model: Option<String>,
-    /// The name of the task that defines the worlds, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
     /// Identifies the worlds: 16 hexadecimal digits of a hash over every setting that affects rewards, except the seed
@@ -52,9 +45,7 @@ pub struct ServerInfo {
     pub burn_in: u64,
     /// Length of an episode in steps; 0 if episodes are never truncated.
     pub max_steps: u64,
-    /// Maximum number of clients at a time.
     pub max_clients: usize,
-    /// The rule that decides which cells a step observes.
     pub coverage: CoverageRule,
     /// Whether the `truth` channel exists.
     pub publish_truth: bool,
@@ -103,12 +94,10 @@ impl ServerInfo {
     }
 }
 
-/// Sequences of recorded hidden states.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecordedWorld {
     /// The description of its states as TOML, if the server reveals it.
     pub description: Option<String>,
-    /// Number of sequences.
     pub n_sequences: usize,
     /// Number of steps of the shortest episode.
     pub n_steps: u64,
@@ -148,8 +137,9 @@ impl AirspaceInfo {
                 "airspace: expected a radius up to {MAX_RADIUS}, got {radius}"
             ));
         }
-        let no_fly = self.no_fly.as_ref();
-        let no_fly = no_fly
+        let no_fly = self
+            .no_fly
+            .as_ref()
             .map(|rows| of_grid("no_fly", shape, rows))
             .transpose()?;
         let no_fly = no_fly.map(|map| Arc::new(map.mapv(|flag| flag != 0)));

@@ -25,7 +25,6 @@ impl Instance {
         &self.0
     }
 
-    /// Returns the error for an instance whose server is in another PID namespace.
     pub fn elsewhere(&self) -> ChannelError {
         ChannelError::OtherPidNamespace {
             instance: self.0.clone(),

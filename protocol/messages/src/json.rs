@@ -32,7 +32,6 @@ pub fn parse<T: DeserializeOwned>(text: &[u8]) -> Result<T, String> {
 mod tests {
     use super::*;
 
-    /// A request type with a single operation.
     #[derive(Debug, serde::Deserialize)]
     #[serde(tag = "op")]
     enum Request {

@@ -48,10 +48,8 @@ impl Claim {
     }
 }
 
-/// The last known state of a world.
 #[derive(Debug, Default)]
 struct Known {
-    /// The last step observed.
     step: AtomicU64,
     /// The `n_sent` of the last paths for the world that were not refused. Only paths that were not refused can have
     /// moved the world.
@@ -75,7 +73,6 @@ pub struct Call<'a> {
 }
 
 impl<'a> Call<'a> {
-    /// Makes a call from a request that [`Lease::request`] returned, and the moves of all paths.
     pub fn new(request: StepRequest, moves: &'a [u8], timeout: Duration) -> Self {
         Self {
             request,
@@ -206,7 +203,6 @@ impl Lease {
             .map(drop)
     }
 
-    /// Sends a request that replaces worlds of the lease, and records their steps.
     fn replace(
         &self,
         backend: &mut dyn Backend,
@@ -222,7 +218,6 @@ impl Lease {
         }
     }
 
-    /// Makes the lease with this number, on robots of a server.
     pub fn new(info: &ServerInfo, number: u64, robots: &Range<u32>) -> Self {
         let worlds = worlds_of(robots.start, robots.len() as u32, info.n_robots);
         Self {
@@ -236,17 +231,14 @@ impl Lease {
         }
     }
 
-    /// Returns the number that the server gave to the lease.
     pub fn number(&self) -> u64 {
         self.number
     }
 
-    /// Returns the worlds of the lease's robots.
     pub fn worlds(&self) -> Range<u32> {
         self.worlds.clone()
     }
 
-    /// Returns the last known step of each world.
     pub fn steps(&self) -> Vec<u64> {
         self.steps_of(self.worlds()).collect()
     }
@@ -258,14 +250,12 @@ impl Lease {
         }
     }
 
-    /// Records the step of each world (see [`Self::note`]).
     pub fn note_all(&self, worlds: &[WorldInfo]) {
         for world in worlds {
             self.note(world.world, world.step);
         }
     }
 
-    /// Makes a request for robots of the server.
     pub fn request(&self, operation: Operation, robots: &Range<u32>, flags: u32) -> StepRequest {
         let flies = operation == Operation::Step;
         StepRequest {
@@ -375,7 +365,6 @@ impl Lease {
         }
     }
 
-    /// Makes a call that observes the robots of `paths`.
     fn look<'a>(&self, paths: &Call<'a>) -> Call<'a> {
         let request = StepRequest {
             operation: Operation::Observe as u32,
@@ -419,7 +408,6 @@ impl Lease {
     }
 }
 
-/// Iterates over the worlds' results in an answer.
 fn results((reply, payload): &StepAnswer) -> impl Iterator<Item = WorldResult> {
     let results = payload
         .chunks_exact(WORLD_BYTES)

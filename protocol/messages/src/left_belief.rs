@@ -11,9 +11,7 @@ use std::time::Duration;
 /// A belief about the current step of a robot's world.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LeftBelief {
-    /// The format of the bytes, and the step.
     pub info: BeliefInfo,
-    /// The belief.
     pub bytes: Vec<u8>,
 }
 

@@ -5,6 +5,8 @@
 //! in the same process. This crate opens no channels. [`limits`] rejects requests for more memory or threads than the
 //! system allows, and [`interrupt`] ends waits.
 
+#![allow(missing_docs, reason = "self-explanatory names need no docs")]
+
 pub mod agent_belief;
 pub mod backend;
 pub mod capacity;

@@ -20,9 +20,7 @@ pub const ROBOT_BYTES: usize = size_of::<RobotResult>();
 /// The payload of a successful step answer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepParts<'a> {
-    /// One result per world.
     pub worlds: Vec<WorldResult>,
-    /// One result per robot.
     pub robots: Vec<RobotResult>,
     /// Frames of `height * width` bytes: one per robot, or one per world with [`FLAG_TEAM_FRAMES`].
     pub frames: &'a [u8],

@@ -8,7 +8,6 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Airspace {
     shape: Shape,
-    /// For each cell, whether it is closed to robots.
     no_fly: Option<Arc<Grid<bool>>>,
     radius: usize,
 }
@@ -36,7 +35,6 @@ impl Airspace {
         }
     }
 
-    /// Returns the shape of the grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
@@ -46,7 +44,6 @@ impl Airspace {
         self.radius
     }
 
-    /// Returns whether robots may fly over every cell of the grid.
     pub fn is_open(&self) -> bool {
         self.no_fly.is_none()
     }
@@ -56,7 +53,6 @@ impl Airspace {
         self.no_fly.as_ref()
     }
 
-    /// Returns whether a cell of the grid is open to robots.
     #[inline]
     pub fn is_free(&self, cell: Cell) -> bool {
         !self

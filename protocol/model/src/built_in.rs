@@ -10,7 +10,6 @@ pub(crate) static TASKS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/t
 /// Built-in recorded states, as `(name, archive of sequences, text of the description)`.
 pub static STATES: &[(&str, &[u8], &str)] = include!(concat!(env!("OUT_DIR"), "/states.rs"));
 
-/// Lists the names of the built-in recorded states.
 pub fn state_names() -> impl Iterator<Item = &'static str> {
     STATES.iter().map(|(name, ..)| *name)
 }

@@ -41,7 +41,6 @@ impl Checker<'_> {
         })
     }
 
-    /// Checks the numbers of states and observations, and their names and colours.
     pub fn counts_and_names(&self, file: &ModelFile) -> Result<(), ModelError> {
         let states: Vec<_> = file.states.iter().map(|s| (&s.name, &s.color)).collect();
         let observations: Vec<_> = file
@@ -125,7 +124,6 @@ impl Checker<'_> {
         self.wrong(what, &expected, format!("{got:e}"))
     }
 
-    /// Checks that values are a probability distribution.
     pub fn distribution(&self, what: &str, values: &[f64]) -> Result<(), ModelError> {
         if values.iter().any(|v| !v.is_finite() || *v < 0.0) {
             return self.wrong(what.into(), "probabilities >= 0", format!("{values:?}"));
@@ -137,7 +135,6 @@ impl Checker<'_> {
         Ok(())
     }
 
-    /// Checks the radius of the sensor.
     pub fn radius(&self, file: &ModelFile) -> Result<(), ModelError> {
         match &file.sensor {
             Some(sensor) if sensor.radius > MAX_RADIUS => {
@@ -251,7 +248,6 @@ impl Checker<'_> {
         self.wrong(what, &expected, format!("{size:?}"))
     }
 
-    /// Returns the transitions of each state.
     pub fn hazards(&self, file: &ModelFile) -> Result<Hazards, ModelError> {
         let maps = file.maps.as_ref().map_or(Ok(Maps::new()), |entry| {
             let unpacked = entry.unpack();
@@ -293,7 +289,6 @@ impl Checker<'_> {
         })
     }
 
-    /// Returns the grid of all maps.
     fn shape_of(&self, maps: &Maps) -> Result<Option<Shape>, ModelError> {
         let mut shape = None;
         for (name, map) in maps {
@@ -319,7 +314,6 @@ impl Checker<'_> {
         Ok(shape)
     }
 
-    /// Returns the product of the maps that a transition names.
     fn factors(&self, entry: &TransitionEntry, maps: &Maps) -> Result<Factors, ModelError> {
         let mut factors = Factors::default();
         for name in &entry.times {
@@ -418,14 +412,12 @@ impl Checker<'_> {
         Ok(weights)
     }
 
-    /// Returns the state of the cells outside the grid, if the file names one.
     pub fn edge(&self, file: &ModelFile) -> Result<Option<usize>, ModelError> {
         let name = file.edge.as_deref();
         name.map(|name| self.state(file, "edge".into(), name))
             .transpose()
     }
 
-    /// Returns the number of a state. `what` is the entry that names it, for errors.
     fn state(&self, file: &ModelFile, what: String, name: &str) -> Result<usize, ModelError> {
         let names: Vec<&str> = file.states.iter().map(|it| it.name.as_str()).collect();
         let found = names.iter().position(|&known| known == name);

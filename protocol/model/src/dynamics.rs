@@ -39,7 +39,6 @@ pub struct Dynamics {
     buffers: Buffers,
 }
 
-/// The tables of a model and grid, which all worlds share.
 #[derive(Debug, Clone)]
 enum Tables {
     Ratio(Arc<ratio::Tables>),
@@ -114,7 +113,6 @@ impl Dynamics {
     }
 }
 
-/// Returns the keys of a step.
 fn keys(seed: u64, n: u64) -> Keys {
     let mut rng = stream(seed, Purpose::Transition, n);
     [rng.next_u64(), rng.next_u64()]

@@ -149,15 +149,10 @@ pub enum ModelError {
         shortened(model)
     )]
     Count {
-        /// The model's name.
         model: String,
-        /// `states` or `observations`.
         what: &'static str,
-        /// Smallest number allowed.
         least: usize,
-        /// Largest number allowed.
         most: usize,
-        /// Number in the file.
         got: usize,
     },
     /// Two entries have the same name.
@@ -167,21 +162,13 @@ pub enum ModelError {
         shortened(name)
     )]
     DuplicateName {
-        /// The model's name.
         model: String,
-        /// `state` or `observation`.
         what: &'static str,
-        /// The repeated name.
         name: String,
     },
     /// A file cannot be read.
     #[error("{}: {problem}", shortened(path))]
-    File {
-        /// The file, after the key that names it.
-        path: String,
-        /// The system's error.
-        problem: String,
-    },
+    File { path: String, problem: String },
     /// An entry has a wrong value.
     #[error(
         "model {:?}: {}: expected {expected}, got {}",
@@ -190,13 +177,9 @@ pub enum ModelError {
         shortened(got)
     )]
     Value {
-        /// The model's name.
         model: String,
-        /// The entry.
         what: String,
-        /// The expected value.
         expected: String,
-        /// The given value.
         got: String,
     },
     /// The transition weights of a cell can all be zero: eq. 3 would divide by zero.
@@ -206,11 +189,8 @@ pub enum ModelError {
          positive weight from every state, or give a state a bias"
     )]
     ZeroWeight {
-        /// The model's name.
         model: String,
-        /// The grid.
         shape: Shape,
-        /// The first such cell.
         cell: Cell,
     },
     /// The transition weights of a cell can all be so small that eq. 3 divides by rounding errors.
@@ -219,11 +199,8 @@ pub enum ModelError {
          the largest weight, expected at least {LEAST_SHARE:e} times for every neighbourhood: raise the small weights"
     )]
     FaintWeight {
-        /// The model's name.
         model: String,
-        /// The grid.
         shape: Shape,
-        /// The first such cell.
         cell: Cell,
         /// The smallest sum of the cell's weights, relative to the largest weight.
         share: f64,
@@ -287,14 +264,12 @@ impl ModelFile {
 }
 
 impl KernelEntry {
-    /// Returns the name of the entry for errors.
     pub(super) fn what(&self) -> String {
         format!("kernel from {:?} to {:?}", self.from, self.to)
     }
 }
 
 impl TransitionEntry {
-    /// Returns the name of the entry for errors.
     pub(super) fn what(&self) -> String {
         format!("transition from {:?} to {:?}", self.from, self.to)
     }

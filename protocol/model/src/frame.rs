@@ -35,11 +35,8 @@ pub enum FrameError {
     /// Wrong number of bytes.
     #[error("frame: expected {expected} bytes for a {shape} grid, got {got}")]
     Length {
-        /// Number of bytes of a frame of the grid.
         expected: usize,
-        /// Number of bytes received.
         got: usize,
-        /// The grid.
         shape: Shape,
     },
     /// A value that is neither an observation nor [`UNOBSERVED`].
@@ -47,17 +44,13 @@ pub enum FrameError {
         "frame: cell {index}: expected an observation below {n_observations} or 255, got {value}"
     )]
     Value {
-        /// Row-major cell index.
         index: usize,
-        /// The byte found there.
         value: u8,
-        /// Number of observations O of the model.
         n_observations: usize,
     },
 }
 
 impl Frame {
-    /// Makes a frame in which nothing was observed.
     pub fn empty(shape: Shape) -> Self {
         Self {
             values: Grid::from_elem(shape.dim(), UNOBSERVED),
@@ -117,7 +110,6 @@ impl Frame {
         cells.filter(|&(_, value)| value != UNOBSERVED)
     }
 
-    /// Marks every cell as unobserved.
     pub fn clear(&mut self) {
         self.values.fill(UNOBSERVED);
     }

@@ -56,22 +56,18 @@ impl Shape {
         }
     }
 
-    /// Returns the number of rows.
     pub fn height(self) -> usize {
         self.height
     }
 
-    /// Returns the number of columns.
     pub fn width(self) -> usize {
         self.width
     }
 
-    /// Returns the number of cells, `H * W`.
     pub fn n_cells(self) -> usize {
         self.height * self.width
     }
 
-    /// Returns whether the cell lies on the grid.
     pub fn contains(self, cell: Cell) -> bool {
         cell.row < self.height && cell.col < self.width
     }

@@ -25,7 +25,6 @@ pub struct Hazards {
 /// A transition of the cells in one state.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Transition {
-    /// The next state.
     pub to: usize,
     /// The hazard without neighbours; infinite if the transition is certain.
     pub base: f64,
@@ -38,7 +37,6 @@ pub struct Transition {
 /// The hazard of one neighbour in one state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Near {
-    /// The neighbour's state.
     pub state: usize,
     /// Row and column of the neighbour, relative to the cell.
     pub offset: [isize; 2],
@@ -84,7 +82,6 @@ impl Hazards {
         numbers
     }
 
-    /// Returns the maps by name.
     pub fn maps(&self) -> &Maps {
         &self.maps
     }

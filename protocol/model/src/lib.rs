@@ -5,6 +5,8 @@
 //! observations. [`mod@settings`] define worlds, a [`task`] is a named set of worlds, and [`built_in`] contains the models,
 //! tasks and recorded states that ship with the programs. [`text`] reads settings and model files.
 
+#![allow(missing_docs, reason = "self-explanatory names need no docs")]
+
 mod airspace;
 pub mod built_in;
 mod cell_map;

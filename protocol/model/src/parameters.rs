@@ -37,7 +37,6 @@ pub struct UnevenPlace {
     pub place: [usize; 2],
     /// The states with the smallest and the largest weight, summed over the next states.
     pub states: [usize; 2],
-    /// These two weights.
     pub weights: [f64; 2],
 }
 
@@ -212,7 +211,6 @@ impl Model {
         Ok(())
     }
 
-    /// Returns the model's name.
     pub fn name(&self) -> &str {
         &self.file.name
     }
@@ -222,23 +220,19 @@ impl Model {
         &self.file
     }
 
-    /// Returns the number of states S.
     pub fn n_states(&self) -> usize {
         self.file.states.len()
     }
 
-    /// Returns the number of observations O.
     pub fn n_observations(&self) -> usize {
         self.file.observations.len()
     }
 
-    /// Returns the names of the observations.
     pub fn observation_names(&self) -> Vec<String> {
         let observations = self.file.observations.iter();
         observations.map(|it| it.name.clone()).collect()
     }
 
-    /// Returns how states change.
     pub fn rule(&self) -> &Rule {
         &self.rule
     }
@@ -305,7 +299,6 @@ impl Model {
         &self.reward
     }
 
-    /// Returns the names of the states.
     pub fn state_names(&self) -> Vec<String> {
         let states = self.file.states.iter();
         states.map(|state| state.name.clone()).collect()
@@ -324,7 +317,6 @@ impl Model {
         (0..self.n_states()).fold(0, better)
     }
 
-    /// Finds a state by its name.
     pub fn state_named(&self, name: &str) -> Option<usize> {
         self.file.states.iter().position(|state| state.name == name)
     }

@@ -11,9 +11,7 @@ const NONE: u32 = u32::MAX;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parts {
     width: usize,
-    /// The part of each cell, by row-major index.
     of_cells: Vec<u32>,
-    /// Number of cells in each part.
     sizes: Vec<usize>,
 }
 
@@ -53,12 +51,10 @@ impl Parts {
         self.sizes.push(size);
     }
 
-    /// Returns the number of free cells.
     pub fn n_free(&self) -> usize {
         self.sizes.iter().sum()
     }
 
-    /// Returns the number of cells in the largest part.
     pub fn n_largest(&self) -> usize {
         self.sizes.iter().copied().max().unwrap_or(0)
     }

@@ -13,7 +13,6 @@ use serde_json::{Map, Value};
 use std::str::FromStr;
 use thiserror::Error;
 
-/// Maximum number of robots of a world.
 pub const MAX_ROBOTS: usize = 64;
 
 /// The range of settings that accept any unsigned 64-bit number.
@@ -28,7 +27,6 @@ pub struct Setting {
     pub help: &'static str,
     /// The default, as JSON.
     pub default: fn() -> Value,
-    /// Returns whether a value has the setting's type.
     pub fits: fn(&Value) -> bool,
     /// Minimum and maximum of a number.
     pub range: Option<(i128, i128)>,
@@ -51,7 +49,6 @@ pub trait Settings: Default + Serialize + DeserializeOwned {
     /// Lists the settings in the order of their declarations.
     fn settings() -> Vec<Setting>;
 
-    /// Returns the values by name.
     fn values(&self) -> Map<String, Value> {
         match serde_json::to_value(self) {
             Ok(Value::Object(values)) => values,
@@ -85,7 +82,6 @@ pub trait Settings: Default + Serialize + DeserializeOwned {
     }
 }
 
-/// The error for a setting with a wrong name or value.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("{}: expected {expected}, got {}", shortened(setting), shortened(got))]
 pub struct SettingError {
@@ -95,7 +91,6 @@ pub struct SettingError {
 }
 
 impl SettingError {
-    /// Describes a wrong value of a setting.
     pub fn new(setting: &str, expected: impl Into<String>, got: impl Into<Value>) -> Self {
         Self {
             setting: setting.into(),
@@ -151,7 +146,6 @@ impl Setting {
         valid.ok_or_else(|| format!("expected {}", self.expected()))
     }
 
-    /// Returns whether the setting is true or false.
     pub fn is_switch(&self) -> bool {
         (self.default)().is_boolean()
     }
@@ -184,7 +178,6 @@ impl Setting {
     }
 }
 
-/// Returns whether a value has a type, for [`Setting::fits`].
 pub fn is<T: DeserializeOwned>(value: &Value) -> bool {
     T::deserialize(value).is_ok()
 }
@@ -281,7 +274,6 @@ settings! {
 }
 
 impl WorldSettings {
-    /// Returns whether the hidden states were recorded.
     pub fn is_recorded(&self) -> bool {
         !self.states.is_empty()
     }

@@ -10,7 +10,6 @@ use std::ops::Range;
 use std::path::Path;
 use thiserror::Error;
 
-/// Maximum number of test seeds.
 pub const MAX_SEEDS: u64 = 100_000;
 
 /// The first seed of worlds for training. Lower seeds are for tests, and nothing may be trained or tuned on them.
@@ -21,17 +20,14 @@ pub const FIRST_TRAINING_SEED: u64 = 1000;
 pub struct Task {
     /// The built-in name or the file path from which the task was loaded.
     pub source: String,
-    /// Name of the task.
     pub name: String,
     /// All settings of the worlds. Settings that recorded states decide are empty or 0.
     pub world: WorldSettings,
-    /// Seeds of the worlds to test on.
     pub test_seeds: Range<u64>,
     /// The task's entry in lists of the built-in tasks.
     pub listing: Option<Listing>,
 }
 
-/// A task file.
 #[derive(Deserialize)]
 struct TaskFile {
     name: String,
@@ -54,7 +50,6 @@ pub struct Listing {
     pub version: u32,
 }
 
-/// The error for a task that cannot be loaded.
 #[derive(Debug, Error)]
 #[error("task {}: {problem}", shortened(task))]
 pub struct TaskError {
@@ -83,7 +78,6 @@ impl Task {
         })
     }
 
-    /// Lists the names of the built-in tasks.
     pub fn built_in_names() -> impl Iterator<Item = &'static str> {
         Self::built_in_files().map(|(name, _)| name)
     }

@@ -91,7 +91,6 @@ impl Transition {
         );
     }
 
-    /// Copies the belief into the planes, inside the margins.
     fn load(&mut self, belief: &[f32]) {
         let (Layout { above, left, .. }, width) = (self.layout, self.shape.width());
         let states = belief.chunks_exact(self.shape.n_cells());
@@ -143,7 +142,6 @@ impl Transition {
     }
 }
 
-/// Returns the [`LANES`] values that begin at a place.
 #[inline(always)]
 fn lanes_from(planes: &[f32], at: usize) -> &Lanes {
     planes[at..]
@@ -151,7 +149,6 @@ fn lanes_from(planes: &[f32], at: usize) -> &Lanes {
         .expect("invariant: the layout has LANES cells from every tap on")
 }
 
-/// Returns the sum of the [`LANES`] values at several offsets.
 #[inline(always)]
 fn add_up(planes: &[f32], offsets: &[usize]) -> Lanes {
     let mut sum = [0.0; LANES];

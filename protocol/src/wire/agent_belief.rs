@@ -21,7 +21,6 @@ pub use emberwatch_messages::agent_belief::{
     AgentBelief, BeliefError, Intent, MAX_INTENT_BYTES, MAX_STATES,
 };
 
-/// An agent's side of the channel.
 #[derive(Debug)]
 pub struct BeliefPublisher {
     ports: Opened<Ports>,

@@ -24,7 +24,6 @@ use std::time::Duration;
 /// `turn.rs` may still be creating a younger file.
 const MAKING: Duration = Duration::from_secs(1);
 
-/// The folders of channel files, and the prefix of their names.
 pub(super) struct ChannelFiles {
     pub(super) root: PathBuf,
     pub(super) shared: PathBuf,
@@ -80,7 +79,6 @@ impl ChannelFiles {
         self.root.join("nodes").join(node.to_string())
     }
 
-    /// Returns the finished tags of one kind in a node's folder.
     pub(super) fn tags(&self, node: u128, suffix: &str) -> Result<HashSet<String>, Error> {
         let mut tags = HashSet::new();
         for path in entries(&self.folder(node))? {
@@ -227,7 +225,6 @@ pub(super) fn lives(id: u128) -> Result<bool, Error> {
     ))
 }
 
-/// Returns the time of the clock that ids use.
 pub(super) fn since_boot() -> Duration {
     let now = clock_gettime(ClockId::Monotonic);
     Duration::new(now.tv_sec as u64, now.tv_nsec as u32)

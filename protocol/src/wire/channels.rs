@@ -51,32 +51,23 @@ pub const AGENT_BUFFER: usize = 4;
 /// Maximum number of processes attached to an instance at a time.
 pub const MAX_NODES: usize = 64;
 
-/// A request-response service whose messages are bytes, with the headers `Q` and `R`.
 pub type RequestResponse<Q, R> =
     request_response::PortFactory<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// The `step` service.
 pub type StepService = RequestResponse<StepRequest, StepReply>;
 
-/// The `control` service.
 pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
 
-/// A publish-subscribe service whose samples are bytes, with the header `H`.
 pub type Publications<H> = publish_subscribe::PortFactory<Ipc, [u8], WireHeader<H>>;
 
-/// The `frames` service.
 pub type FrameService = Publications<FrameHeader>;
 
-/// The `truth` service.
 pub type TruthService = Publications<TruthHeader>;
 
-/// The `agent` service.
 pub type AgentService = Publications<AgentHeader>;
 
-/// A wake service.
 pub type WakeService = event::PortFactory<Ipc>;
 
-/// A channel of an instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Channel {
     /// Steps, request-response.
@@ -109,7 +100,6 @@ impl Channel {
     }
 }
 
-/// Returns the service name of a channel.
 pub fn service_name(instance: &Instance, channel: Channel) -> ServiceName {
     let name = format!("emberwatch/v3/{}/{}", instance.name(), channel.name());
     ServiceName::new(&name).expect("invariant: instance names are short and plain")
@@ -125,9 +115,7 @@ fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
 
 /// The services of an instance. The methods open or create each service with its limits.
 pub struct Services<'a> {
-    /// The process's node.
     pub node: &'a Node<Ipc>,
-    /// The instance.
     pub instance: &'a Instance,
 }
 
@@ -149,26 +137,15 @@ impl Services<'_> {
         self.create(Channel::Control)
     }
 
-    /// Opens the `step` service of a running server.
-    ///
-    /// # Errors
-    /// If no server is running.
     pub fn open_step(&self) -> Result<StepService, ChannelError> {
         self.open(Channel::Step)
     }
 
-    /// Opens the `control` service of a running server.
-    ///
-    /// # Errors
-    /// If no server is running.
     pub fn open_control(&self) -> Result<ControlService, ChannelError> {
         self.open(Channel::Control)
     }
 
     /// Opens or creates the `frames` service. Observers may create it before the server starts.
-    ///
-    /// # Errors
-    /// If iceoryx2 can neither open nor create it.
     pub fn frames(&self) -> Result<FrameService, ChannelError> {
         self.publications(Channel::Frames, 1, MAX_OBSERVERS, FRAME_BUFFER)
             .map_err(ipc_error("open the frames channel"))
@@ -184,36 +161,22 @@ impl Services<'_> {
     }
 
     /// Opens or creates the `agent` service. An agent or a reader may create it.
-    ///
-    /// # Errors
-    /// If iceoryx2 can neither open nor create it.
     pub fn agent(&self) -> Result<AgentService, ChannelError> {
         self.publications(Channel::Agent, MAX_CLIENTS, MAX_AGENT_READERS, AGENT_BUFFER)
             .map_err(ipc_error("open the agent channel"))
     }
 
-    /// Opens or creates a wake service.
-    ///
-    /// # Errors
-    /// If iceoryx2 can neither open nor create it.
     pub fn wake(&self, channel: Channel) -> Result<WakeService, ChannelError> {
-        let builder = self
-            .node
+        self.node
             .service_builder(&service_name(self.instance, channel))
-            .event();
-        let builder = builder
+            .event()
             .max_listeners(MAX_NODES)
             .max_notifiers(MAX_NODES)
-            .max_nodes(MAX_NODES);
-        builder
+            .max_nodes(MAX_NODES)
             .open_or_create()
             .map_err(ipc_error("open a wake channel"))
     }
 
-    /// Creates a listener on a wake service.
-    ///
-    /// # Errors
-    /// If iceoryx2 can neither open nor create it.
     pub fn listener(&self, channel: Channel) -> Result<Listener<Ipc>, ChannelError> {
         // iceoryx2 0.10 changes the umask of the process while it binds a listener's socket. If two threads did this at
         // once, the second could permanently restore the umask that the first had set only for a moment.
@@ -232,39 +195,33 @@ impl Services<'_> {
         n_readers: usize,
         buffer: usize,
     ) -> Result<Publications<H>, PublishSubscribeOpenOrCreateError> {
-        let name = service_name(self.instance, channel);
-        let builder = self.node.service_builder(&name);
-        let builder = builder
+        self.node
+            .service_builder(&service_name(self.instance, channel))
             .publish_subscribe::<[u8]>()
-            .user_header::<WireHeader<H>>();
-        let builder = builder
+            .user_header::<WireHeader<H>>()
             .max_publishers(n_publishers)
             .max_subscribers(n_readers)
-            .max_nodes(MAX_NODES);
-        let builder = builder.history_size(1).subscriber_max_buffer_size(buffer);
-        let builder = builder
+            .max_nodes(MAX_NODES)
+            .history_size(1)
+            .subscriber_max_buffer_size(buffer)
             .subscriber_max_borrowed_samples(1)
-            .enable_safe_overflow(true);
-        builder.open_or_create()
+            .enable_safe_overflow(true)
+            .open_or_create()
     }
 
     fn create<Q: Header, R: Header>(
         &self,
         channel: Channel,
     ) -> Result<RequestResponse<Q, R>, ChannelError> {
-        let builder = self
-            .builder::<Q, R>(channel)
+        self.builder::<Q, R>(channel)
             .max_servers(1)
             .max_clients(MAX_CLIENTS)
-            .max_nodes(MAX_NODES);
-        let builder = builder
+            .max_nodes(MAX_NODES)
             .max_active_requests_per_client(1)
-            .max_loaned_requests(1);
-        let builder = builder
+            .max_loaned_requests(1)
             .max_response_buffer_size(1)
-            .max_borrowed_responses_per_pending_response(1);
-        let builder = builder.enable_fire_and_forget_requests(false);
-        builder
+            .max_borrowed_responses_per_pending_response(1)
+            .enable_fire_and_forget_requests(false)
             .open_or_create()
             .map_err(ipc_error("create a request channel"))
     }
@@ -291,17 +248,14 @@ impl Services<'_> {
         &self,
         channel: Channel,
     ) -> request_response_builder::Builder<[u8], WireHeader<Q>, [u8], WireHeader<R>, Ipc> {
-        let builder = self
-            .node
-            .service_builder(&service_name(self.instance, channel));
-        let builder = builder.request_response::<[u8], [u8]>();
-        builder
+        self.node
+            .service_builder(&service_name(self.instance, channel))
+            .request_response::<[u8], [u8]>()
             .request_user_header::<WireHeader<Q>>()
             .response_user_header::<WireHeader<R>>()
     }
 }
 
-/// Returns the node of the service's server, running or dead.
 pub(crate) fn server_node<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<u128> {
     let mut node = None;
     service.dynamic_config().list_servers(|server| {

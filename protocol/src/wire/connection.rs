@@ -122,7 +122,6 @@ impl Connection {
         Ok(Opened::new(entries, ports))
     }
 
-    /// Returns the server's settings.
     pub fn info(&self) -> &ServerInfo {
         &self.info
     }
@@ -180,7 +179,6 @@ impl Backend for Connection {
     }
 }
 
-/// Sleeps, unless an interrupt ends the sleep.
 fn sleep(pause: Duration) -> Result<(), ChannelError> {
     let start = Instant::now();
     while let left @ 1.. = pause.saturating_sub(start.elapsed()).as_millis() as u64 {
@@ -192,7 +190,6 @@ fn sleep(pause: Duration) -> Result<(), ChannelError> {
 
 const WHAT: &str = "step";
 
-/// Rejects an answer to another request.
 fn check_asked(
     info: &ServerInfo,
     request: &StepRequest,

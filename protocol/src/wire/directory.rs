@@ -121,7 +121,6 @@ pub fn node_config() -> Result<Config, ChannelError> {
     Ok(config)
 }
 
-/// Returns the prefix of the names of this user's shared memory.
 pub(crate) fn prefix() -> String {
     format!("emberwatch-{}_", rustix::process::getuid().as_raw())
 }
@@ -157,7 +156,6 @@ fn others(folder: &std::path::Path, own: u32) -> Option<String> {
     (!users.is_empty()).then(sentence)
 }
 
-/// Returns the error for a file or folder that the system does not allow this process to use.
 pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> ChannelError {
     if error.raw_os_error() == Some(Errno::MFILE.raw_os_error()) {
         return no_descriptors("use the channel directory", CLIENT_DESCRIPTORS);
@@ -177,7 +175,6 @@ pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> Chann
     )
 }
 
-/// Returns the error for a file or folder.
 pub(crate) fn directory_error(path: &std::path::Path, problem: String) -> ChannelError {
     ChannelError::Directory {
         path: path.display().to_string(),

@@ -26,7 +26,6 @@ const LONGEST_SLEEP: Duration = Duration::from_millis(50);
 /// Maximum time for the answering side to release an abandoned request.
 const RELEASE_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// A port that sends requests.
 pub(super) type RequestClient<Q, R> = Client<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 /// The resources of a request and its answer: the wake-ups in both directions, and the server's process.
@@ -113,10 +112,8 @@ impl Exchange {
     }
 }
 
-/// A request that is waiting for its answer.
 type Pending<Q, R> = PendingResponse<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// Sends a request as soon as the previous one is released.
 fn send<Q: Header, R: Header>(
     client: &RequestClient<Q, R>,
     header: Q,
@@ -138,7 +135,6 @@ fn send<Q: Header, R: Header>(
     }
 }
 
-/// Returns a copy of an answer's payload.
 pub(super) fn copied(what: &str, payload: &[u8]) -> Result<Vec<u8>, NoMemory> {
     let mut copy = with_capacity(format_args!("the answer to {what}"), payload.len())?;
     copy.extend_from_slice(payload);

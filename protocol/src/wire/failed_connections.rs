@@ -17,7 +17,6 @@ pub struct FailedConnections {
 }
 
 impl FailedConnections {
-    /// Returns a handler that counts the failed connections of a port.
     pub fn counter(&self) -> impl DegradationFn + 'static {
         let count = self.count.clone();
         move |_: DegradationCause, _: &DegradationInfo| {

@@ -28,11 +28,9 @@ struct Turns {
 
 /// One world's belief, the posterior after the frame of `result`.
 pub struct View<'a> {
-    /// Number of the world.
     pub world: u32,
     /// Numbers of the robots that the agent flies in it.
     pub robots: Range<u32>,
-    /// The result of the step.
     pub result: &'a WorldResult,
     /// The belief, shape `[S, H, W]`.
     pub belief: &'a Probabilities,
@@ -55,7 +53,6 @@ impl Feed {
         }
     }
 
-    /// Returns a feed without readers.
     pub fn closed() -> Self {
         Self {
             publisher: None,
@@ -63,7 +60,6 @@ impl Feed {
         }
     }
 
-    /// Returns whether a belief is due and there are readers.
     pub fn is_due(&self) -> bool {
         !self.due(1).is_empty()
     }
@@ -78,14 +74,12 @@ impl Feed {
         }
     }
 
-    /// Returns whether there are readers.
     pub fn is_watched(&self) -> bool {
         self.publisher
             .as_ref()
             .is_some_and(BeliefPublisher::is_watched)
     }
 
-    /// Ends the feed, after readers have had time to receive the last belief.
     pub fn end(self) {
         let began = Instant::now();
         while self.turns.shown.is_some() && self.is_watched() && began.elapsed() < FAREWELL {
@@ -93,7 +87,6 @@ impl Feed {
         }
     }
 
-    /// Publishes a belief if the channel is open.
     pub fn show(&mut self, view: &View<'_>) {
         let Some(publisher) = &mut self.publisher else {
             return;

@@ -47,7 +47,6 @@ pub(crate) struct Opened<T> {
 }
 
 impl<T> Opened<T> {
-    /// Wraps ports. `entries` are the files of their node.
     pub(crate) fn new(entries: Entries, ports: T) -> Self {
         Self {
             ports: Some(ports),
@@ -55,7 +54,6 @@ impl<T> Opened<T> {
         }
     }
 
-    /// Checks that other processes can still find the ports.
     pub(crate) fn check(&self) -> Result<(), ChannelError> {
         self.entries.check_at(Instant::now())
     }

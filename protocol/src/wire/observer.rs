@@ -41,7 +41,6 @@ pub struct Observer<H: Published> {
     polling: Polling,
 }
 
-/// Gaps in sequence numbers.
 #[derive(Debug, Default)]
 struct Gaps {
     /// The number that is expected next from each process that publishes. A new process begins a new sequence.
@@ -57,7 +56,6 @@ impl Gaps {
     }
 }
 
-/// Chooses the interval between polls.
 #[derive(Debug)]
 struct Polling {
     buffer: usize,
@@ -170,10 +168,6 @@ impl<H: Published> Observer<H> {
         }
     }
 
-    /// Returns the next sample, if there already is one.
-    ///
-    /// # Errors
-    /// If iceoryx2 cannot read the channel, or its files were removed.
     pub fn try_receive(&self) -> Result<Option<Sample<H>>, ChannelError> {
         let (subscriber, _) = &*self.ports;
         let sample = subscriber

@@ -44,7 +44,6 @@ fn readable(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> Result<Vec<boo
     Ok(polled.iter().map(|fd| !fd.revents().is_empty()).collect())
 }
 
-/// Returns whether a descriptor is readable now.
 pub fn is_readable(descriptor: BorrowedFd<'_>) -> bool {
     sleep_until_readable(&[descriptor], Duration::ZERO).is_ok_and(|readable| readable[0])
 }

@@ -9,27 +9,15 @@ use rustix::process::{Pid, PidfdFlags, getpid, pidfd_open};
 use std::io::{Error, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
-/// A process that is watched until it ends.
 #[derive(Debug)]
 pub struct WatchedProcess(OwnedFd);
 
-/// The error if the process that `--exit-with` names does not run or cannot be watched.
 #[derive(Debug, thiserror::Error)]
 pub enum NotWatched {
-    /// There is no such process.
     #[error("--exit-with {pid}: expected a running process, got none with this id")]
-    NotRunning {
-        /// The process id.
-        pid: i32,
-    },
-    /// The system does not allow watching the process.
+    NotRunning { pid: i32 },
     #[error("--exit-with {pid}: {problem}")]
-    Refused {
-        /// The process id.
-        pid: i32,
-        /// The failed call, and what to do.
-        problem: ChannelError,
-    },
+    Refused { pid: i32, problem: ChannelError },
 }
 
 impl WatchedProcess {
@@ -66,12 +54,10 @@ impl WatchedProcess {
             .map_err(watch_error)
     }
 
-    /// Returns a descriptor that is readable when the process has ended.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }
 
-    /// Returns whether the process has ended.
     pub fn has_ended(&self) -> bool {
         is_readable(self.descriptor())
     }

@@ -131,7 +131,6 @@ pub(super) fn check_descriptors(what: &'static str, needed: usize) -> Result<(),
     free_descriptors(needed).map_err(|_| no_descriptors(what, needed))
 }
 
-/// Returns the error for a failed system call that is not about a file.
 pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
     match errno {
         Errno::MFILE | Errno::NFILE => no_descriptors(call, CLIENT_DESCRIPTORS),
@@ -142,7 +141,6 @@ pub fn call_error(call: &'static str, errno: Errno) -> ChannelError {
     }
 }
 
-/// Returns the error for a process that cannot open more files.
 pub(super) fn no_descriptors(what: &'static str, needed: usize) -> ChannelError {
     let limit = getrlimit(Resource::Nofile).current;
     ChannelError::NoDescriptors {

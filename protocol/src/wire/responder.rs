@@ -32,10 +32,8 @@ const LAST_ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 /// A request that is waiting for its answer.
 pub type Active<Q, R> = ActiveRequest<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
-/// A JSON request that is waiting for its answer.
 pub type ActiveControl = Active<ControlRequest, ControlReply>;
 
-/// The answering port of a service of JSON messages.
 pub type ControlServer =
     Server<Ipc, [u8], WireHeader<ControlRequest>, [u8], WireHeader<ControlReply>>;
 
@@ -47,10 +45,6 @@ pub struct Answers {
 }
 
 impl Answers {
-    /// Opens the wake service of an instance, to send answers to its clients.
-    ///
-    /// # Errors
-    /// If the wake service cannot be opened.
     pub fn new(services: &Services<'_>) -> Result<Self, ChannelError> {
         let wake = services.wake(Channel::WakeClient)?;
         let notifier = wake.notifier_builder().create();
@@ -171,7 +165,6 @@ pub fn port_owner<Q: Header, R: Header>(
         .flatten()
 }
 
-/// Returns a listener's id from the two halves in a request's header.
 pub fn listener_id(low: u64, high: u64) -> u128 {
     u128::from(low) | u128::from(high) << 64
 }

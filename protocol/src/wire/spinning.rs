@@ -32,7 +32,6 @@ pub struct Spinning {
 }
 
 impl Spinning {
-    /// Begins a wait.
     pub fn begin(&mut self, now: Instant) {
         let may_spin = self.not_before.is_none_or(|end| now >= end);
         self.wait = may_spin.then_some((now, now));
@@ -58,7 +57,6 @@ impl Spinning {
         false
     }
 
-    /// Ends the wait, because something has arrived.
     pub fn arrived(&mut self) {
         if self.wait.is_some() {
             self.n_vain = 0;

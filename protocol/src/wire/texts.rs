@@ -25,7 +25,6 @@ const SLICE: usize = 4096;
 
 const WHAT: &str = "a control request";
 
-/// The port for JSON requests, and the resources that all requests of its connection share.
 pub(super) struct TextPort {
     client: RequestClient<ControlRequest, ControlReply>,
     sequence: u64,
@@ -42,7 +41,6 @@ struct Common {
 }
 
 impl TextPort {
-    /// Makes the port of the service. The port owns the node, which ends with it.
     pub(super) fn create(
         node: Node<Ipc>,
         instance: &Instance,
@@ -101,7 +99,6 @@ impl TextPort {
         Ok(answer)
     }
 
-    /// Sends a JSON request and returns its reply.
     pub(super) fn ask(
         &mut self,
         text: &[u8],
@@ -132,7 +129,6 @@ impl TextPort {
     }
 }
 
-/// Returns the process of a service's server.
 fn server_process(
     service: &ControlService,
     instance: &Instance,

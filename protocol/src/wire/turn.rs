@@ -190,7 +190,6 @@ fn is_file(file: &OwnedFd, path: &Path) -> bool {
     }
 }
 
-/// Returns the process that has the lock.
 fn holder(file: &OwnedFd) -> Option<i32> {
     let found = fstat(file).ok()?;
     lock_holder("FLOCK", found.st_dev, found.st_ino)

@@ -11,23 +11,18 @@ use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
-/// Maximum time to read settings and the files that they name.
 pub const LONGEST_READ: Duration = Duration::from_secs(20);
 
 /// Milliseconds without use after which a lease on worlds in this process expires, unless a setting decides it: a day,
 /// because no other client waits for their robots.
 const LEASE_MILLIS: u64 = 86_400_000;
 
-/// The reason why settings could not be read.
 #[derive(Debug, Error)]
 pub enum ReadError {
-    /// A setting or a file that it names is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The file could block, and no thread could be started to read it.
     #[error(transparent)]
     Threads(#[from] NoThreads),
-    /// The file was not read in time, or the wait was interrupted.
     #[error(transparent)]
     Wait(#[from] ConnectionError),
 }
@@ -57,10 +52,6 @@ pub fn may_block(path: &str) -> bool {
     found.is_ok_and(|kind| !kind.is_file() && !kind.is_dir())
 }
 
-/// Runs `read`; if it may block, in a thread, and waits at most [`LONGEST_READ`] for it.
-///
-/// # Errors
-/// If no thread can be started, or the wait times out or is interrupted.
 pub fn in_time<T: Send + 'static>(
     may_block: bool,
     read: impl FnOnce() -> T + Send + 'static,
@@ -73,7 +64,6 @@ pub fn in_time<T: Send + 'static>(
     Ok(wait_for(&receiver, Instant::now(), LONGEST_READ)?)
 }
 
-/// Refuses settings that apply only to a server.
 fn check_embeddable(settings: &ServerConfig) -> Result<(), SettingError> {
     let values = settings.values();
     let for_servers = ServerConfig::settings();

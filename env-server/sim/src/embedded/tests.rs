@@ -1,32 +1,44 @@
 use super::*;
 use crate::config::ServerConfig;
 use emberwatch_messages::client::{Claim, Client, Observation};
-use emberwatch_messages::control::{Request, WorldSeed};
+use emberwatch_messages::control::{CoverageRule, Request, WorldInfo, WorldSeed};
 use emberwatch_model::path::Move;
 use emberwatch_model::settings::WorldSettings;
+use emberwatch_model::{Coverage, UNOBSERVED};
 use serde_json::{Value, json};
 use std::fmt::Debug;
 
 const LONG: Duration = Duration::from_secs(60);
 
 fn client(n_worlds: u32, burn_in: u64) -> Client<Embedded> {
-    let config = ServerConfig {
+    client_of(ServerConfig {
         worlds: n_worlds,
         world: WorldSettings {
-            height: 7,
-            width: 5,
-            moves: 4,
             burn_in,
-            model: "wildfire-small".into(),
-            ..WorldSettings::default()
+            ..small_worlds()
         },
         ..ServerConfig::default()
-    };
+    })
+}
+
+fn small_worlds() -> WorldSettings {
+    WorldSettings {
+        height: 7,
+        width: 5,
+        moves: 4,
+        burn_in: 20,
+        model: "wildfire-small".into(),
+        ..WorldSettings::default()
+    }
+}
+
+/// Creates worlds, and a client that holds a robot in each.
+fn client_of(config: ServerConfig) -> Client<Embedded> {
+    let n_worlds = config.worlds;
     let worlds = Embedded::new(config.check().expect("settings")).expect("worlds");
     Client::acquire(worlds, &Claim::new(0..n_worlds)).expect("a lease")
 }
 
-/// Flies one path with each robot.
 fn step(client: &mut Client<Embedded>) -> Result<Vec<Observation>, ConnectionError> {
     let path = vec![Move::Down, Move::Right, Move::Down, Move::Right];
     let paths = vec![path; client.robots().len()];
@@ -57,11 +69,98 @@ fn a_client_flies_resets_and_recalls() {
     }
     assert_eq!(client.observe(0..2).expect("worlds"), second);
     assert_eq!(client.recall(0..2, 1).expect("kept"), first);
+    assert_eq!(status(client.recall(0..2, 3)), Status::NotKept);
     client.reset(&reset(1, 5)).expect("a world");
     let seen = step(&mut client).expect("a step");
     assert_eq!([0, 1].map(|robot: usize| seen[robot].world.step), [3, 1]);
     client.renew().expect("a lease");
     client.release().expect("a lease");
+}
+
+#[test]
+fn a_world_does_not_depend_on_worlds_next_to_it_or_on_threads() {
+    let start = |worlds, threads, seed| {
+        let world = WorldSettings {
+            height: 72,
+            width: 72,
+            burn_in: 3,
+            ..small_worlds()
+        };
+        client_of(ServerConfig {
+            worlds,
+            threads,
+            seed,
+            coverage: CoverageRule::Full,
+            world,
+            ..ServerConfig::default()
+        })
+    };
+    // A batch so large that both threads step it.
+    let mut together = start(8, 2, 0);
+    let all: Vec<_> = (0..5)
+        .map(|_| step(&mut together).expect("a step"))
+        .collect();
+    assert_ne!(all[4][0].frame, all[4][1].frame);
+    for world in 0..8 {
+        let mut alone = start(1, 1, world as u64);
+        for seen in &all {
+            assert_eq!(step(&mut alone).expect("a step")[0], seen[world]);
+        }
+    }
+}
+
+#[test]
+fn a_reset_begins_an_episode_with_an_empty_frame_and_a_seed() {
+    let mut client = client(3, 20);
+    step(&mut client).expect("a step");
+    let seeds = [(2, 0), (0, u64::MAX)];
+    let begun = client.reset(&seeds.map(|(world, seed)| reset(world, seed)[0]));
+    let expected = seeds.map(|(world, seed)| WorldInfo {
+        world,
+        step: 0,
+        seed,
+        episode: 1,
+        robots: vec![[0, 0]],
+    });
+    assert_eq!(begun.expect("worlds"), expected, "in the order of requests");
+    let seen = client.observe(0..1).expect("a world").remove(0);
+    assert_eq!(seen.frame.as_bytes(), [UNOBSERVED; 35]);
+    assert_eq!(seen.robot.coverage, Coverage::Empty as u32);
+    assert_eq!((seen.world.reward, seen.world.n_visited), (0.0, 0));
+    // Without a given seed, each reset chooses a new one.
+    let mut seeds = Vec::from_iter((0..4).map(|_| {
+        let world = WorldSeed {
+            world: 0,
+            seed: None,
+        };
+        client.reset(&[world]).expect("a world")[0].seed
+    }));
+    seeds.sort_unstable();
+    seeds.dedup();
+    assert_eq!(seeds.len(), 4, "{seeds:?}");
+    assert!(seeds[0] > 0 && seeds[3] < 1 << 53, "{seeds:?}");
+}
+
+#[test]
+fn an_episode_is_over_at_max_steps_until_it_is_reset() {
+    let mut client = client_of(ServerConfig {
+        worlds: 2,
+        world: WorldSettings {
+            max_steps: 2,
+            ..small_worlds()
+        },
+        ..ServerConfig::default()
+    });
+    for is_truncated in [0, 1] {
+        let seen = step(&mut client).expect("a step");
+        assert!(seen.iter().all(|it| it.world.truncated == is_truncated));
+        assert!(seen.iter().all(|it| it.world.terminated == 0));
+    }
+    assert_eq!(status(step(&mut client)), Status::EpisodeOver);
+    client.reset(&reset(0, 5)).expect("a world");
+    assert_eq!(status(step(&mut client)), Status::EpisodeOver);
+    assert_eq!(client.observe(0..1).expect("a world")[0].world.step, 0);
+    client.step(0..1, &[vec![Move::Up; 4]]).expect("a step");
 }
 
 #[test]
@@ -76,6 +175,8 @@ fn a_restored_snapshot_continues_in_the_same_way() {
         .backend()
         .control(&request(save), LONG)
         .expect("a file");
+    let present = client.observe(0..2).expect("worlds");
+    let past = client.recall(0..2, 0).expect("kept");
     let future = step(&mut client).expect("a step");
     let lease = client.lease();
     let load = request(
@@ -83,7 +184,8 @@ fn a_restored_snapshot_continues_in_the_same_way() {
         "from": 0, "path": path}),
     );
     client.backend().control(&load, LONG).expect("worlds");
-    client.observe(0..2).expect("worlds");
+    assert_eq!(client.observe(0..2).expect("worlds"), present);
+    assert_eq!(client.recall(0..2, 0).expect("kept"), past);
     assert_eq!(step(&mut client).expect("a step"), future);
 }
 

@@ -11,10 +11,6 @@ pub const INSTANCE: &str = "(embedded)";
 /// How often a waiting call checks for an interrupt.
 const INTERVAL: Duration = Duration::from_millis(5);
 
-/// Receives a value from another thread, for at most `timeout` after `start`.
-///
-/// # Errors
-/// [`ConnectionError::Timeout`] if the time is over or the sender was dropped, or the error of the interrupt.
 pub fn wait_for<T>(
     receiver: &Receiver<T>,
     start: Instant,

@@ -16,7 +16,6 @@ use std::time::Instant;
 const PARALLEL_CELLS: usize = 1 << 15;
 
 impl Simulator {
-    /// Returns the earliest deadline of the worlds that wait for paths.
     pub fn next_deadline(&self) -> Option<Instant> {
         let waiting = self.waiting_worlds.iter();
         let deadlines = waiting.filter_map(|&world| self.places[world].barrier.deadline);
@@ -92,7 +91,6 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Returns whether a world has the paths for its next step, or its deadline has passed.
     pub(super) fn is_complete(&self, now: Instant, world: usize) -> bool {
         let held = self.leases.held(self.robots_of(world));
         self.places[world].barrier.is_complete(held, now)

@@ -11,9 +11,7 @@ use emberwatch_model::UNOBSERVED;
 use std::hint::black_box;
 use std::ops::Range;
 
-/// The slices of an answer's payload for one world: its result, and the results and frames of its robots.
 pub(super) struct Part<'a> {
-    /// The robots in the answer, by their index in the world.
     robots: Range<usize>,
     world: &'a mut [u8],
     results: &'a mut [u8],
@@ -23,7 +21,6 @@ pub(super) struct Part<'a> {
 }
 
 impl Part<'_> {
-    /// Writes the current results and frames of an episode.
     pub(super) fn write(self, episode: &Episode) {
         let world = world_result(episode.outcome());
         self.world.copy_from_slice(bytemuck::bytes_of(&world));
@@ -70,7 +67,6 @@ impl Simulator {
         }
     }
 
-    /// Returns the header of a successful answer, and the robots in the answer.
     pub(super) fn answer(&self, request: &StepRequest) -> (StepReply, Range<usize>) {
         let first = request.first_robot as usize;
         let robots = first..first + request.n_robots as usize;
@@ -83,7 +79,6 @@ impl Simulator {
         (reply, robots)
     }
 
-    /// Returns the number of bytes in the payload of a successful answer.
     fn n_bytes(&self, request: &StepRequest) -> usize {
         let (reply, _) = self.answer(request);
         let (n_worlds, n_robots) = (reply.n_worlds as usize, reply.n_robots as usize);
@@ -147,7 +142,6 @@ impl Simulator {
         self.worlds_of(&robots).map(part).collect()
     }
 
-    /// Writes the current results and frames of the requested robots, and returns the header.
     pub(super) fn write_present(&self, request: &StepRequest, payload: &mut [u8]) -> StepReply {
         let (reply, robots) = self.answer(request);
         let parts = self.parts(request, payload);
@@ -199,14 +193,12 @@ impl Simulator {
     }
 }
 
-/// Splits off and returns the first `n` bytes.
 fn take<'a>(bytes: &mut &'a mut [u8], n: usize) -> &'a mut [u8] {
     let (first, rest) = std::mem::take(bytes).split_at_mut(n);
     *bytes = rest;
     first
 }
 
-/// Appends a frame without observations and returns it.
 fn blank(payload: &mut Vec<u8>, n_cells: usize) -> &mut [u8] {
     let start = payload.len();
     payload.resize(start + n_cells, UNOBSERVED);

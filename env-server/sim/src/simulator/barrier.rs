@@ -6,11 +6,9 @@ use emberwatch_messages::message::StepRequest;
 use emberwatch_model::Move;
 use std::time::Instant;
 
-/// Identifies a step request that waits for its world to move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Ticket(pub(super) u64);
 
-/// A waiting step request, and the robots whose paths it sent.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Waiter {
     pub ticket: Ticket,
@@ -25,9 +23,7 @@ pub(super) struct Waiter {
 pub(super) struct Barrier {
     /// One path per robot, in order. Only paths of robots in `ready` are valid.
     pub moves: Vec<Move>,
-    /// Robots that have a path.
     pub ready: u64,
-    /// Robots that observe every cell in this step.
     pub full: u64,
     /// The time at which the world moves even if paths are missing.
     pub deadline: Option<Instant>,
@@ -91,7 +87,6 @@ impl Barrier {
     }
 }
 
-/// Returns a mask of the `n` robots that start with robot `first`, among at most 64 robots.
 pub(super) fn mask(first: usize, n: usize) -> u64 {
     u64::MAX.unbounded_shr(64 - n as u32) << first
 }

@@ -24,19 +24,16 @@ const N_MOVES: usize = 2;
 const LEASE: Duration = Duration::from_secs(20);
 const DEADLINE: Duration = Duration::from_millis(50);
 
-/// A simulator of two worlds with three robots each, and the simulated time.
 struct Lab {
     simulator: Simulator,
     now: Instant,
 }
 
-/// Returns the client whose process has this id.
 fn client(pid: u32) -> ClientId {
     let node = u128::from(pid);
     ClientId { node, pid }
 }
 
-/// Returns a path that differs between robots.
 fn path(robot: u32) -> [u8; N_MOVES] {
     [(robot % 4) as u8, (robot / 2 % 4) as u8]
 }
@@ -80,7 +77,6 @@ impl Lab {
         }
     }
 
-    /// Acquires robots; returns the lease.
     fn acquire(&mut self, pid: u32, first_robot: u32, n_robots: u32, takeover: bool) -> u64 {
         let request = Request::Acquire {
             first_robot,
@@ -443,4 +439,70 @@ fn a_world_is_reset_only_by_the_holder_of_all_held_robots() {
     assert_eq!(lab.ask(1, &reset(leases[0])).status(), Status::Ok);
     assert_eq!(lab.answers(), [(waiting, Status::Resetting, 0)]);
     assert_eq!((lab.world().seed, lab.world().step), (9, 0));
+}
+
+#[test]
+fn a_team_frame_joins_the_frames_of_a_world_s_robots() {
+    let mut lab = Lab::new(Duration::ZERO);
+    let lease = lab.acquire(1, 0, 3, false);
+    assert_eq!(lab.replies(1, lease, (0, 3), 0).0, Status::Ok);
+    let robots = lab.episode().robots();
+    let joined = |cell: usize| {
+        robots
+            .iter()
+            .map(|robot| robot.frame().as_bytes()[cell])
+            .min()
+    };
+    let joined: Vec<u8> = (0..4 * 5).filter_map(joined).collect();
+    let step_1 = 1_u64.to_ne_bytes();
+    for (operation, body) in [
+        (Operation::Observe, &[][..]),
+        (Operation::Recall, &step_1[..]),
+    ] {
+        let request = StepRequest {
+            version: VERSION,
+            operation: operation as u32,
+            first_robot: 1,
+            n_robots: 1,
+            flags: FLAG_TEAM_FRAMES,
+            ..StepRequest::default()
+        };
+        let (client, mut payload) = (client(9), Vec::new());
+        let stepped = (lab.simulator).step(lab.now, client, &request, body, &mut payload);
+        let Stepped::Reply(reply) = stepped else {
+            panic!("expected an answer");
+        };
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        assert_eq!(parts.frames, joined, "{operation:?}");
+    }
+}
+
+#[test]
+fn a_lease_has_the_length_asked_for_and_lists_the_robots_that_it_still_holds() {
+    let mut lab = Lab::new(Duration::ZERO);
+    let usual = LEASE.as_millis() as u64;
+    for (asked, given) in [
+        (Some(150), 150),
+        (Some(0), 100),
+        (Some(u64::MAX), 86_400_000),
+        (None, usual),
+    ] {
+        let request = Request::Acquire {
+            first_robot: 0,
+            n_robots: 6,
+            takeover: false,
+            ttl_millis: asked,
+        };
+        let Reply::Lease(lease) = lab.ask(1, &request) else {
+            panic!("expected a lease");
+        };
+        assert_eq!(lease.ttl_millis, given, "{asked:?}");
+    }
+    let lease = lab.acquire(1, 0, 6, false);
+    lab.acquire(2, 0, 4, true);
+    let Reply::Lease(renewed) = lab.ask(1, &Request::Renew { lease }) else {
+        panic!("expected a lease");
+    };
+    assert_eq!((renewed.lease, renewed.robots), (lease, vec![4, 5]));
+    assert!(renewed.worlds.iter().map(|world| world.world).eq([1]));
 }

@@ -11,7 +11,6 @@ const N_STATES: usize = 18;
 /// Maximum size in bytes of the data in a belief besides its `f32` grids.
 const MORE_BYTES: u64 = 32 << 10;
 
-/// The stored beliefs, at most one per robot.
 #[derive(Debug)]
 pub struct Beliefs {
     /// Maximum length of a belief in bytes: one `f32` per state and cell, one more `f32` per cell, and [`MORE_BYTES`].
@@ -25,20 +24,16 @@ struct StoredBelief {
     bytes: Vec<u8>,
 }
 
-/// A part of a belief, as sent in one request.
 #[derive(Debug)]
 pub struct BeliefPart<'a> {
     /// The format of the bytes, for other agents.
     pub kind: &'a str,
-    /// Position of the part in the belief, in bytes.
     pub offset: u64,
-    /// Length of the whole belief, in bytes.
     pub length: u64,
     pub bytes: &'a [u8],
 }
 
 impl Beliefs {
-    /// Creates an empty store for `n_robots` robots in worlds of `n_cells` cells and `n_states` states.
     pub fn new(n_robots: usize, n_cells: usize, n_states: usize) -> Self {
         let numbers = n_cells * (n_states.max(N_STATES) + 1);
         Self {
@@ -92,7 +87,6 @@ impl Beliefs {
         Ok(())
     }
 
-    /// Returns the complete belief stored for a robot at the current step of its world.
     pub fn of(&self, robot: usize, at: &WorldOutcome) -> Option<(&BeliefInfo, &[u8])> {
         let StoredBelief { info, bytes } = self.left[robot].as_ref()?;
         let is_there = (info.seed, info.episode, info.step) == (at.seed, at.episode, at.step);
@@ -100,7 +94,6 @@ impl Beliefs {
         (is_there && is_whole).then_some((info, bytes))
     }
 
-    /// Drops the beliefs stored for the robots of a world that was replaced.
     pub fn forget(&mut self, robots: Range<usize>) {
         self.left[robots].fill_with(|| None);
     }

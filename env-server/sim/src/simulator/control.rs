@@ -20,14 +20,11 @@ use rand_chacha::rand_core::Rng;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Maximum duration of a lease: one day.
 const LONGEST_LEASE: Duration = Duration::from_secs(86_400);
 
-/// Minimum duration of a lease.
 const SHORTEST_LEASE: Duration = Duration::from_millis(100);
 
 impl Simulator {
-    /// Handles a control request.
     pub fn control(
         &mut self,
         now: Instant,
@@ -70,7 +67,6 @@ impl Simulator {
         })
     }
 
-    /// Cancels a pending reply whose client has stopped waiting.
     pub fn cancel_reply(&mut self, now: Instant, pending: &PendingReply) {
         self.leases.end_wait(now, pending.lease);
     }
@@ -158,7 +154,6 @@ impl Simulator {
         Outcome::Pending(jobs, pending)
     }
 
-    /// Answers with a description of the lease once its worlds are ready.
     fn lease_reply(&mut self, lease: u64, client: ClientId) -> Outcome {
         let robots = self.leases.robots_held(lease);
         let mut worlds: Vec<usize> = robots
@@ -239,7 +234,6 @@ impl Simulator {
         }
     }
 
-    /// Returns the server's answer to `hello`.
     pub fn info(&self) -> ServerInfo {
         self.checked.info()
     }
@@ -313,7 +307,6 @@ fn airspace_info(model: &Model) -> Option<AirspaceInfo> {
     (info.radius > 0 || info.no_fly.is_some()).then_some(info)
 }
 
-/// Checks the version of a message and parses its request.
 fn read(version: u32, text: &[u8]) -> Result<Request, Reply> {
     if version != VERSION {
         return Err(Reply::version_mismatch(version));

@@ -13,19 +13,14 @@ use std::time::{Duration, Instant};
 /// Number of ended leases that are remembered, so that an ended lease can be distinguished from one that never existed.
 const REMEMBERED: usize = 1024;
 
-/// The connection and process behind a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClientId {
-    /// The id of the client's iceoryx2 node.
     pub node: u128,
-    /// The client's process id.
     pub pid: u32,
 }
 
-/// The exclusive right of a client to fly some robots.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Lease {
-    /// Identifies the lease in requests.
     pub token: u64,
     pub client: ClientId,
     /// The robots for which the lease was acquired.
@@ -40,23 +35,19 @@ pub struct Lease {
     n_waiting: u32,
 }
 
-/// The reason for refusing a request: a status and its detail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Refusal {
     pub status: Status,
     pub detail: u64,
 }
 
-/// All leases of a server.
 #[derive(Debug)]
 pub struct Leases {
-    /// The token of the lease that holds each robot.
     holders: Vec<Option<u64>>,
     live: HashMap<u64, Lease>,
     ended: VecDeque<Ended>,
 }
 
-/// A lease that has ended.
 #[derive(Debug)]
 struct Ended {
     token: u64,
@@ -65,12 +56,10 @@ struct Ended {
     taken_by: Option<u32>,
 }
 
-/// A client's request for a lease.
 #[derive(Debug, Clone)]
 pub struct Claim {
     pub client: ClientId,
     pub robots: Range<usize>,
-    /// Whether to take robots over from their holders.
     pub takeover: bool,
     /// Time after its last use at which the lease expires.
     pub time_to_live: Duration,
@@ -89,7 +78,6 @@ impl Lease {
 }
 
 impl Leases {
-    /// Creates a table of `n_robots` robots without leases.
     pub fn new(n_robots: usize) -> Self {
         Self {
             holders: vec![None; n_robots],
@@ -138,9 +126,6 @@ impl Leases {
     }
 
     /// Checks that a client may fly robots under a lease, and extends the lease.
-    ///
-    /// # Errors
-    /// If a robot does not exist, or the client does not hold it under this lease.
     pub fn use_lease(
         &mut self,
         now: Instant,
@@ -158,10 +143,6 @@ impl Leases {
         self.renew(now, token, client).map(|_| ())
     }
 
-    /// Extends a lease.
-    ///
-    /// # Errors
-    /// If the client never had this lease or has lost it.
     pub fn renew(&mut self, now: Instant, token: u64, client: ClientId) -> Result<&Lease, Refusal> {
         let is_live = |lease: &&mut Lease| lease.client == client && !lease.has_expired(now);
         if self.live.get_mut(&token).filter(is_live).is_none() {
@@ -174,9 +155,6 @@ impl Leases {
     }
 
     /// Checks that a client may reset or replace the world of these robots under a lease, and extends the lease.
-    ///
-    /// # Errors
-    /// If the client holds none of the robots under this lease, or another client holds one.
     pub fn use_world(
         &mut self,
         now: Instant,
@@ -196,7 +174,6 @@ impl Leases {
         }
     }
 
-    /// Counts a waiting request, during which the lease does not expire.
     pub fn begin_wait(&mut self, token: u64) {
         if let Some(lease) = self.live.get_mut(&token) {
             lease.n_waiting += 1;
@@ -211,22 +188,16 @@ impl Leases {
         }
     }
 
-    /// Ends a lease, which frees its robots.
-    ///
-    /// # Errors
-    /// If the client never had this lease or has lost it.
     pub fn release(&mut self, now: Instant, token: u64, client: ClientId) -> Result<(), Refusal> {
         self.renew(now, token, client)?;
         self.end(token);
         Ok(())
     }
 
-    /// Ends and returns the leases that have expired.
     pub fn expire(&mut self, now: Instant) -> Vec<Lease> {
         self.end_where(|lease| lease.has_expired(now))
     }
 
-    /// Ends and returns the leases of a process that has died.
     pub fn end_of_process(&mut self, pid: u32) -> Vec<Lease> {
         self.end_where(|lease| lease.client.pid == pid)
     }
@@ -236,7 +207,6 @@ impl Leases {
         self.end_where(|lease| !nodes.contains(&lease.client.node))
     }
 
-    /// Returns the robots that a lease still holds.
     pub fn robots_held(&self, token: u64) -> Vec<usize> {
         let held = |robot: &usize| self.holders[*robot] == Some(token);
         let lease = self.live.get(&token);
@@ -245,7 +215,6 @@ impl Leases {
         })
     }
 
-    /// Returns the lease that holds a robot.
     pub fn holder(&self, robot: usize) -> Option<&Lease> {
         self.holders[robot].and_then(|token| self.live.get(&token))
     }
@@ -278,7 +247,6 @@ impl Leases {
         self.ended.iter().find(|ended| ended.token == token)
     }
 
-    /// Returns the refusal for a client that does not hold a robot under a lease.
     pub fn not_held(&self, token: u64, client: ClientId, robot: usize) -> Refusal {
         let is_own = |lease: &&Lease| lease.client == client && lease.robots.contains(&robot);
         let holder = self.holder(robot).map(|holder| holder.client.pid);
@@ -321,7 +289,6 @@ impl Leases {
         Some(lease)
     }
 
-    /// Ends leases that have lost all their robots.
     fn forget_empty_leases(&mut self) {
         let holders = self.holders.clone();
         let is_empty = |lease: &Lease| {

@@ -8,9 +8,7 @@ use emberwatch_messages::message::Status;
 use std::ops::Range;
 use std::time::Duration;
 
-/// The result of a control request: work that the caller must do, and the answer.
 pub enum Outcome {
-    /// An immediate answer.
     Answer(Reply),
     /// Resets to run, and an answer that follows when the requested worlds are ready.
     Pending(Vec<ResetJob>, PendingReply),
@@ -22,7 +20,6 @@ pub enum Outcome {
     Shutdown,
 }
 
-/// An answer that waits until worlds have been reset.
 pub struct PendingReply {
     pub(super) worlds: Vec<usize>,
     pub(super) lease: u64,
@@ -31,19 +28,15 @@ pub struct PendingReply {
     pub(super) describes_lease: bool,
 }
 
-/// The parts of a status reply that the simulator does not know and its caller provides.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ServerStats {
     pub uptime: Duration,
     /// World steps per second, measured over about the last second.
     pub steps_per_second: f64,
-    /// Number of clients on the step channel.
     pub n_clients: usize,
-    /// Number of observers of frames.
     pub n_observers: usize,
 }
 
-/// A reply that waits for a file.
 #[derive(Debug)]
 pub enum PendingFile {
     /// A snapshot is being written; contains the worlds in it.
@@ -56,7 +49,6 @@ pub enum PendingFile {
     },
 }
 
-/// Returns the reply to a malformed request.
 pub(super) fn malformed(problem: &str) -> Reply {
     let message = format!("{}: {problem}", Status::Malformed.explain(0));
     Reply::error(Status::Malformed, 0, message)

@@ -21,7 +21,6 @@ pub struct Simulator {
     pub(super) beliefs: Beliefs,
     pub(super) places: Vec<Place>,
     pub(super) leases: Leases,
-    /// Worlds for which requests wait.
     pub(super) waiting_worlds: Vec<usize>,
     /// Step requests that have stopped waiting but are not answered yet. A request that is to be refused has an `Err`.
     pub(super) settled: VecDeque<(Waiter, Result<(), Refusal>)>,
@@ -34,13 +33,11 @@ pub struct Simulator {
     pub(super) n_refused: u64,
 }
 
-/// A world and its barrier.
 pub(super) struct Place {
     pub slot: Slot,
     pub barrier: Barrier,
 }
 
-/// A world, which is either ready or in its burn-in.
 pub(super) enum Slot {
     Ready(Box<Episode>),
     /// A world in its burn-in. `last` and `cells` are its outcome and its robots' cells before the reset.
@@ -52,10 +49,8 @@ pub(super) enum Slot {
     },
 }
 
-/// A reset of a world, to be run outside the simulator.
 pub struct ResetJob {
     pub world: usize,
-    /// The world's previous episode, if any.
     pub before: Option<Box<Episode>>,
     /// Number of the new episode. Used only if there is no previous episode.
     pub episode: u64,
@@ -101,7 +96,6 @@ impl Simulator {
         Ok((simulator, jobs))
     }
 
-    /// Installs the episode of a world, for example after its reset.
     pub fn put(&mut self, world: usize, episode: Box<Episode>) {
         self.places[world].slot = Slot::Ready(episode);
         self.beliefs.forget(self.robots_of(world));
@@ -112,7 +106,6 @@ impl Simulator {
         &self.spec
     }
 
-    /// Returns whether the worlds show recorded states.
     pub fn is_recorded(&self) -> bool {
         self.checked.recorded.is_some()
     }
@@ -146,34 +139,28 @@ impl Simulator {
         }
     }
 
-    /// Returns the range of all worlds.
     pub fn worlds(&self) -> Range<usize> {
         0..self.places.len()
     }
 
-    /// Returns the number of world steps so far.
     pub fn n_steps(&self) -> u64 {
         self.n_steps
     }
 
-    /// Checks that worlds exist, and returns their range.
     pub(super) fn range(&self, first: u32, n_worlds: u32) -> Result<Range<usize>, Refusal> {
         checked(first, n_worlds, self.places.len(), Status::NoSuchWorld)
     }
 
-    /// Checks that robots exist, and returns their range.
     pub(super) fn robot_range(&self, first: u32, n_robots: u32) -> Result<Range<usize>, Refusal> {
         let n_all = self.places.len() * self.spec.rules.n_robots;
         checked(first, n_robots, n_all, Status::NoSuchRobot)
     }
 
-    /// Returns the worlds to which robots belong.
     pub fn worlds_of(&self, robots: &Range<usize>) -> Range<usize> {
         let team = self.spec.rules.n_robots;
         robots.start / team..robots.end.div_ceil(team)
     }
 
-    /// Returns the robots of a world.
     pub(super) fn robots_of(&self, world: usize) -> Range<usize> {
         let team = self.spec.rules.n_robots;
         world * team..(world + 1) * team

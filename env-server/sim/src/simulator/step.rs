@@ -19,24 +19,19 @@ use emberwatch_model::path::{MoveError, check_moves};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// The outcome of a step request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Stepped {
-    /// An immediate answer.
     Reply(StepReply),
     /// The request waits until its world moves. [`Simulator::next_answer`] then returns the answer.
     Waits(Ticket),
 }
 
-/// How a valid request is answered.
 enum Granted<'a> {
     /// The payload already contains the answer.
     Written,
-    /// The answer shows the current step of the worlds.
     Present,
     /// The answer shows past steps. Contains one step number for each world, as bytes.
     Past(&'a [u8]),
-    /// The request waits, because its world still lacks other paths.
     Waits(Ticket),
 }
 
@@ -171,7 +166,6 @@ impl Simulator {
         ticket
     }
 
-    /// Checks that the history of each world contains the requested step.
     fn check_kept(&self, worlds: Range<usize>, steps: &[u8]) -> Result<(), Refusal> {
         let mut episodes = worlds
             .filter_map(|world| self.episode(world))
@@ -233,7 +227,6 @@ impl Simulator {
         Ok(())
     }
 
-    /// Checks that each world can step, and that the paths start at its current step.
     fn check_ready(&self, robots: &Range<usize>, body: &[u8]) -> Result<(), Refusal> {
         for (world, step) in self.worlds_of(robots).zip(numbers(body)) {
             let Some(episode) = self.episode(world) else {
@@ -272,7 +265,6 @@ fn check_length(body: &[u8], expected: usize) -> Result<(), Refusal> {
     Err(Refusal::new(Status::WrongLength, expected as u64))
 }
 
-/// Reads 64-bit numbers from the start of a payload.
 pub(super) fn numbers(bytes: &[u8]) -> impl Iterator<Item = u64> {
     let (numbers, _) = bytes.as_chunks::<8>();
     numbers.iter().map(|&bytes| u64::from_ne_bytes(bytes))

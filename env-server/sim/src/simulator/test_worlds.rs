@@ -16,7 +16,6 @@ pub fn new_simulator(config: ServerConfig) -> (Simulator, Vec<ResetJob>) {
     Simulator::new(checked, threads.expect("a thread"), next_token).expect("a valid model")
 }
 
-/// Runs burn-ins to their end.
 pub fn finish(simulator: &mut Simulator, jobs: Vec<ResetJob>) {
     for job in jobs {
         let (world, episode) = job.run(&simulator.spec().rules);

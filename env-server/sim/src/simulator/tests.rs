@@ -6,6 +6,7 @@ use super::state::{ResetJob, Simulator};
 use super::step::Stepped;
 use super::test_worlds::{finish, new_simulator};
 use crate::config::ServerConfig;
+use crate::snapshot::{NewEpisode, SnapshotWorld};
 use emberwatch_messages::control::Reply;
 use emberwatch_messages::message::{Operation, Status, StepRequest, VERSION};
 use emberwatch_messages::payload::write_step_body;
@@ -14,7 +15,6 @@ use std::time::{Duration, Instant};
 
 const US: ClientId = ClientId { node: 1, pid: 7 };
 
-/// Duration of a lease in these settings.
 const LEASE: Duration = Duration::from_secs(20);
 
 /// Creates two worlds in their first burn-in, and the jobs that end it.
@@ -38,7 +38,6 @@ fn ask(simulator: &mut Simulator, now: Instant, request: &str) -> Outcome {
     simulator.control(now, US, VERSION, request.as_bytes(), &stats)
 }
 
-/// Sends a request whose answer must wait.
 fn wait(simulator: &mut Simulator, now: Instant, request: &str) -> (Vec<ResetJob>, PendingReply) {
     let Outcome::Pending(jobs, pending) = ask(simulator, now, request) else {
         panic!("{request} is not answered later");
@@ -50,14 +49,12 @@ fn wait(simulator: &mut Simulator, now: Instant, request: &str) -> (Vec<ResetJob
 const ACQUIRE: &str = r#"{"op":"acquire","first_robot":0,"n_robots":2}"#;
 const RESET: &str = r#"{"op":"reset","lease":1,"worlds":[{"world":0,"seed":77}]}"#;
 
-/// Requests a step of world 0 from step k, and returns the status.
 fn step(simulator: &mut Simulator, now: Instant, k: u64) -> Status {
     let mut body = Vec::new();
     write_step_body(&[k], &[1, 3], &mut body);
     status_of(simulator, now, Operation::Step, &body)
 }
 
-/// Sends a request for world 0 and returns the status.
 fn status_of(simulator: &mut Simulator, now: Instant, what: Operation, body: &[u8]) -> Status {
     let request = StepRequest {
         version: VERSION,
@@ -139,4 +136,18 @@ fn a_lease_outlives_the_burn_ins_that_its_client_waits_for() {
     let almost = now + LEASE - Duration::from_millis(1);
     assert!(simulator.tick(almost).is_empty());
     assert_eq!(simulator.tick(now + LEASE), [US.pid]);
+}
+
+#[test]
+fn a_saved_burn_in_begins_again() {
+    let (mut simulator, _) = start();
+    let saved = NewEpisode {
+        seed: 77,
+        episode: 3,
+    };
+    let job = simulator.start_with(1, SnapshotWorld::New(saved));
+    assert!(simulator.episode(1).is_none());
+    finish(&mut simulator, vec![job.expect("a burn-in")]);
+    let begun = simulator.episode(1).expect("ready").outcome();
+    assert_eq!((begun.seed, begun.episode, begun.step), (77, 3, 0));
 }

@@ -15,7 +15,6 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 impl Simulator {
-    /// Encodes worlds as the bytes of a snapshot file.
     pub fn snapshot(&self, worlds: Range<usize>) -> Result<Vec<u8>, SnapshotError> {
         let places = self.places[worlds].iter();
         let worlds: Vec<_> = places
@@ -55,7 +54,6 @@ impl Simulator {
         }
     }
 
-    /// Returns the answer to a request that waited for a file.
     pub fn file_reply(
         &mut self,
         now: Instant,
@@ -72,7 +70,6 @@ impl Simulator {
         }
     }
 
-    /// Replaces the worlds of a restore request with the worlds read from its file.
     fn finish_restore(
         &mut self,
         now: Instant,
@@ -221,7 +218,6 @@ impl Simulator {
         }))
     }
 
-    /// Checks that a client may replace worlds under a lease, and that none of them is being reset.
     fn check_replaceable(
         &mut self,
         now: Instant,
@@ -236,7 +232,6 @@ impl Simulator {
         self.check_present(worlds)
     }
 
-    /// Returns the current outcome of the robots' world, or the refusal if it is being reset.
     fn present(&self, robots: &Range<usize>) -> Result<WorldOutcome, Reply> {
         let world = self.worlds_of(robots).start;
         let episode = self.episode(world);

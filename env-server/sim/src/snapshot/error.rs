@@ -2,7 +2,6 @@
 
 use thiserror::Error;
 
-/// The reason for refusing a snapshot: what was expected and what was found.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SnapshotError {
     /// The file is damaged. The caller may try an older file, which may be intact.
@@ -14,7 +13,6 @@ pub enum SnapshotError {
 }
 
 impl SnapshotError {
-    /// Creates the error for a file with the wrong number of worlds.
     pub fn n_worlds(expected: impl ToString, got: usize) -> Self {
         let expected = expected.to_string();
         Self::Unfit(format!("worlds: expected {expected}, got {got}"))

@@ -10,7 +10,6 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use thiserror::Error;
 
-/// The error for pipes, devices, folders and links.
 const NOT_A_FILE: &str = "expected a regular file, got a folder, link, pipe or device";
 
 /// Ending of a file's name while it is being written.
@@ -18,18 +17,15 @@ pub(super) const PART: &str = ".part";
 
 static N_PARTS: AtomicU64 = AtomicU64::new(0);
 
-/// An error in writing or reading a snapshot file.
 #[derive(Debug, Error)]
 #[error("snapshot file {path}: {problem}")]
 pub struct FileError {
-    /// The file or its folder.
     pub path: String,
     pub problem: String,
     /// Whether the file is damaged, so that an older one should be tried.
     pub is_damaged: bool,
 }
 
-/// The failures that a newly written file survives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Durability {
     /// The death of any process.
@@ -74,14 +70,12 @@ fn sync_folder_of(path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Reads a snapshot file.
 pub fn read(path: &Path) -> Result<Snapshot, FileError> {
     let bytes = read_bytes(path).map_err(|error| failed(path, error))?;
     let snapshot = bytes.and_then(|bytes| decode(&bytes));
     snapshot.map_err(|error| refused(path, error))
 }
 
-/// Creates the error for a file whose contents are refused.
 pub fn refused(path: &Path, error: SnapshotError) -> FileError {
     FileError {
         path: path.display().to_string(),

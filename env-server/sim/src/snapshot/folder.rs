@@ -5,10 +5,8 @@ use emberwatch_messages::instance::Instance;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Number of digits in a file's number.
 const DIGITS: usize = 12;
 
-/// Ending of snapshot files in a folder.
 const EXTENSION: &str = "snapshot";
 
 /// A folder that contains the latest snapshots of an instance as numbered files.
@@ -19,7 +17,6 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// Creates the handle for an instance's snapshots in a folder, without reading the folder.
     pub fn new(path: &Path, instance: &Instance) -> Self {
         Self {
             path: path.into(),
@@ -51,7 +48,6 @@ impl Folder {
         }
     }
 
-    /// Removes unfinished files of killed servers.
     fn remove_parts(&self) -> io::Result<()> {
         for entry in std::fs::read_dir(&self.path)?.flatten() {
             let name = entry.file_name();
@@ -83,7 +79,6 @@ impl Folder {
         Ok(files)
     }
 
-    /// Returns the pattern of the instance's file names.
     pub fn pattern(&self) -> String {
         format!("{}-<{DIGITS} digits>.{EXTENSION}", self.instance)
     }

@@ -16,23 +16,18 @@ use emberwatch_messages::limits::memory::in_words;
 use emberwatch_model::Grid;
 use emberwatch_model::path::path_to_bytes;
 
-/// The first bytes of every snapshot.
 pub const MAGIC: [u8; 8] = *b"EMBRSNAP";
 
-/// The version of the format.
 pub const VERSION: u32 = 2;
 
 /// Length of the header: magic, version, checksum and body length.
 pub(super) const HEADER_BYTES: usize = 8 + 4 + 4 + 8;
 
-/// Maximum size of a file's body: 4 GiB.
 pub const MAX_BYTES: u64 = 1 << 32;
 
-/// The configuration of bincode: integers of fixed size.
 const FORM: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// Saved worlds of a server, and the settings that they depend on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
     pub settings: Settings,
@@ -44,15 +39,12 @@ pub struct Snapshot {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum SnapshotWorld<T> {
     Ready(T),
-    /// A world that was in its burn-in.
     New(NewEpisode),
 }
 
-/// An episode before its burn-in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NewEpisode {
     pub seed: u64,
-    /// Number of the episode.
     pub episode: u64,
 }
 
@@ -70,7 +62,6 @@ struct EncodedWorld<'a> {
 /// A past step: the world's result, and for each robot its result, the observed cells and the observations.
 type Past<B> = (Vec<u8>, Vec<(Vec<u8>, B, B)>);
 
-/// A world decoded from a file, with the same fields as [`EncodedWorld`].
 #[derive(Decode)]
 struct DecodedWorld {
     result: Vec<u8>,
@@ -80,7 +71,6 @@ struct DecodedWorld {
     history: Vec<Past<Vec<u8>>>,
 }
 
-/// Encodes worlds as the bytes of a file.
 pub fn encode(
     settings: &Settings,
     worlds: &[SnapshotWorld<&Episode>],
@@ -178,7 +168,6 @@ fn checked_body(bytes: &[u8]) -> Result<&[u8], SnapshotError> {
     Ok(body)
 }
 
-/// Checks a header against the actual length of the body, `got`, and returns the checksum in the header.
 pub(super) fn checked_length(header: &[u8], got: u64) -> Result<u32, SnapshotError> {
     if header.len() < HEADER_BYTES || header[..8] != MAGIC {
         let problem =

@@ -9,35 +9,32 @@ use crate::world::Episode;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-/// A job that reads or writes a snapshot file.
 #[derive(Debug)]
 pub enum Job {
-    /// Writes a snapshot.
-    Save { path: PathBuf, bytes: Vec<u8> },
+    Save {
+        path: PathBuf,
+        bytes: Vec<u8>,
+    },
     /// Writes the server's next automatic snapshot.
     Autosave {
         folder: Folder,
         durability: Durability,
-        /// Number of files to keep.
         keep: usize,
-        /// A further file to keep.
         also_keep: Option<PathBuf>,
         bytes: Vec<u8>,
     },
-    /// Reads the worlds in this range from a snapshot.
-    Load { path: PathBuf, worlds: Range<usize> },
+    Load {
+        path: PathBuf,
+        worlds: Range<usize>,
+    },
 }
 
-/// The result of a job.
 pub enum Done {
-    /// A file was written.
     Saved { path: PathBuf, n_bytes: usize },
-    /// Worlds were read.
     Loaded(Vec<SnapshotWorld<Box<Episode>>>),
 }
 
 impl Job {
-    /// Reads or writes the file.
     pub fn run(self, spec: &WorldSpec) -> Result<Done, FileError> {
         match self {
             Self::Save { path, bytes } => {

@@ -25,11 +25,9 @@ const WORLDS: u32 = 1;
 pub struct Settings {
     /// The model file as TOML, without its maps.
     pub model: String,
-    /// All other settings, as pairs of name and value.
     pub others: Vec<(String, String)>,
 }
 
-/// The settings and rules of a server's worlds, which restored worlds must fit.
 #[derive(Debug, Clone)]
 pub struct WorldSpec {
     pub settings: Settings,
@@ -37,7 +35,6 @@ pub struct WorldSpec {
 }
 
 impl WorldSpec {
-    /// Returns the specification of a server's worlds.
     pub fn of(checked: &Checked) -> Result<Self, ModelError> {
         let Checked {
             config,
@@ -64,7 +61,6 @@ impl WorldSpec {
 }
 
 impl Settings {
-    /// Extracts the settings on which worlds depend.
     pub fn of(checked: &Checked) -> Self {
         let config = &checked.config;
         let file = ModelFile {
@@ -117,7 +113,6 @@ impl Settings {
         hexadecimal(&hash.finalize()[..8])
     }
 
-    /// Checks that these settings, which come from a file, equal a server's settings.
     pub fn check(&self, server: &Self) -> Result<(), SnapshotError> {
         let other = |setting: &str, expected: &str, got: &str| {
             let problem = format!("{setting}: expected {expected}, as on this server, got {got}");

@@ -110,7 +110,6 @@ fn every_truncation_and_every_changed_byte_is_detected() {
     assert!(said.starts_with("malformed: "), "{said}");
 }
 
-/// Builds an array of pairs: a change to a world, and the resulting error.
 macro_rules! changes {
     ($world:ident: $($change:block $words:literal)*) => {
         &[$((|$world| $change, $words)),*]
@@ -148,7 +147,6 @@ const MISFITS: &[(Change, &str)] = changes! { world:
     { world.history[3].robots[0].values.pop(); } "history: expected 0 values, got 14"
 };
 
-/// A no-fly cell.
 const CLOSED: Cell = Cell { row: 2, col: 0 };
 
 #[test]

@@ -15,7 +15,6 @@ use super::sensor::Sensor;
 use emberwatch_model::path::path_from_bytes;
 use emberwatch_model::{Coverage, Frame, Grid};
 
-/// The current episode of one world.
 #[derive(Debug, Clone)]
 pub struct Episode {
     world: World,
@@ -30,12 +29,10 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// Creates a world at k = 0, in its first episode.
     pub fn new(rules: &Rules, seed: u64) -> Self {
         Self::numbered(rules, seed, 0)
     }
 
-    /// Creates a world at k = 0, in the episode with this number.
     pub fn numbered(rules: &Rules, seed: u64, episode: u64) -> Self {
         let world = World::new(rules.source.clone(), seed, rules.burn_in, &rules.ended);
         Self::beginning(rules, world, episode)
@@ -81,12 +78,10 @@ impl Episode {
         self.history.push(&self.outcome, &self.robots);
     }
 
-    /// Returns the world's outcome of the last step or reset.
     pub fn outcome(&self) -> &WorldOutcome {
         &self.outcome
     }
 
-    /// Returns the robots, in order.
     pub fn robots(&self) -> &[Robot] {
         &self.robots
     }
@@ -103,7 +98,6 @@ impl Episode {
         self.history.step(step).ok_or(nearest)
     }
 
-    /// Estimates the size of this episode in a snapshot, in bytes.
     pub fn n_bytes(&self) -> usize {
         let of_robot = |robot: &Robot| robot.frame.as_bytes().len() + robot.path.len() + 128;
         let robots: usize = self.robots.iter().map(of_robot).sum();
@@ -115,7 +109,6 @@ impl Episode {
         self.world.states()
     }
 
-    /// Returns whether the episode was truncated and cannot step before a reset.
     pub fn is_over(&self) -> bool {
         self.outcome.is_truncated
     }
@@ -125,7 +118,6 @@ impl Episode {
         self.beginning.states()
     }
 
-    /// Returns the steps in the history, from the oldest to the current one.
     pub fn history(&self) -> impl ExactSizeIterator<Item = &PastStep> {
         self.history.all()
     }
@@ -238,9 +230,10 @@ mod tests {
     use emberwatch_model::settings::Start;
     use emberwatch_model::{Cell, Model, Move, Shape};
 
-    fn rules(max_steps: u64, start: Start) -> Rules {
+    fn rules(radius: usize, start: Start) -> Rules {
         let shape = Shape::new(12, 20).expect("test shape");
-        Rules::new(&Model::wildfire(), shape, 2000, max_steps, start).expect("valid model")
+        let model = Model::wildfire().with_radius(radius).expect("a radius");
+        Rules::new(&model, shape, 2000, 0, start).expect("valid model")
     }
 
     fn path(bytes: &[u8]) -> Vec<Move> {
@@ -261,17 +254,29 @@ mod tests {
 
     #[test]
     fn reward_counts_distinct_burning_cells_after_the_transition() {
-        let rules = rules(0, Start::Centre);
-        let mut episode = Episode::new(&rules, 0);
+        check_rewards(&rules(0, Start::Centre));
+    }
+
+    #[test]
+    fn a_wide_sensor_sees_around_the_path_but_only_visited_cells_pay() {
+        check_rewards(&rules(2, Start::Centre));
+    }
+
+    fn check_rewards(rules: &Rules) {
+        let mut episode = Episode::new(rules, 0);
         let mut total = 0;
         for k in 0..2000 {
             if k % 50 == 0 {
-                episode.reset(&rules, k);
+                episode.reset(rules, k);
             }
             let there_and_back = [3, 3, 0, 1, 2, 2];
             let start = episode.robots()[0].cell();
             let flight = fly(rules.shape, start, &path(&there_and_back));
-            step(&mut episode, &rules, &there_and_back, 0);
+            step(&mut episode, rules, &there_and_back, 0);
+            let frame = episode.robots()[0].frame();
+            let mut in_sight = rules.airspace.see(&flight.visited);
+            in_sight.sort_unstable();
+            assert!(frame.observed().map(|(cell, _)| cell).eq(in_sight));
             let states = episode.states().as_slice().expect("row-major");
             let is_fire = |cell: &&usize| states[**cell] == 2;
             let n_hits = flight.visited.iter().filter(is_fire).count();

@@ -7,9 +7,7 @@ use emberwatch_model::{Coverage, Move};
 pub struct Flown<'a> {
     /// One path per robot of the world, in order and of equal length. Only paths of robots in `ready` are flown.
     pub moves: &'a [Move],
-    /// Robots that have a path.
     pub ready: u64,
-    /// Robots that observe every cell, not only their path.
     pub full: u64,
     /// Robots that stay because no client holds them.
     pub hovered: u64,
@@ -18,7 +16,6 @@ pub struct Flown<'a> {
 }
 
 impl Flown<'_> {
-    /// Returns which cells a robot observes.
     pub(super) fn coverage(&self, robot: usize) -> Coverage {
         match (self.ready >> robot & 1, self.full >> robot & 1) {
             (0, _) => Coverage::Empty,

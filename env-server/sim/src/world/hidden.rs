@@ -9,14 +9,12 @@ use emberwatch_model::{Dynamics, Grid};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// The source of hidden states.
 #[derive(Debug, Clone)]
 pub enum Source {
     Simulated(Dynamics),
     Recorded(Arc<Recorded>),
 }
 
-/// The hidden states of one world at its current step.
 #[derive(Debug, Clone)]
 pub struct World {
     source: Source,
@@ -37,7 +35,6 @@ impl Source {
 }
 
 impl World {
-    /// Creates a world at k = 0. Simulates `burn_in` steps, and stops early when `ended` is set.
     pub fn new(mut source: Source, seed: u64, burn_in: u64, ended: &AtomicBool) -> Self {
         let states = match &mut source {
             Source::Recorded(recorded) => recorded.states(seed, 0),
@@ -52,7 +49,6 @@ impl World {
         Self::at(source, seed, burn_in, 0, states)
     }
 
-    /// Creates a world at step k from its hidden states.
     pub fn at(source: Source, seed: u64, burn_in: u64, step: u64, states: Grid<u8>) -> Self {
         Self {
             source,
@@ -86,7 +82,6 @@ impl World {
         self.seed
     }
 
-    /// Returns the step index k.
     pub fn step(&self) -> u64 {
         self.step
     }

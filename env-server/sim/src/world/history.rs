@@ -12,7 +12,6 @@ pub const MIN_HISTORY_BYTES: usize = 1 << 20;
 #[derive(Debug, Clone)]
 pub struct History {
     n_steps: usize,
-    /// Capacity for frames, in bytes.
     max_bytes: usize,
     n_bytes: usize,
     steps: VecDeque<PastStep>,
@@ -26,19 +25,14 @@ pub fn bytes_of_history(n_steps: usize, n_robots: usize, most_seen: usize) -> us
     n_steps.saturating_mul(of_step)
 }
 
-/// The outcomes and frames of one step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PastStep {
-    /// The world's outcome.
     pub outcome: WorldOutcome,
-    /// The outcome and frame of each robot, in order.
     pub robots: Vec<PastRobot>,
 }
 
-/// One robot's outcome and frame of a step, in sparse form.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PastRobot {
-    /// The robot's outcome.
     pub outcome: RobotOutcome,
     /// Row-major indices of the observed cells. Empty if all cells were observed.
     pub cells: Vec<u32>,
@@ -59,7 +53,6 @@ impl History {
         }
     }
 
-    /// Appends a step, and drops the oldest steps while the history exceeds its capacity.
     pub fn push(&mut self, outcome: &WorldOutcome, robots: &[Robot]) {
         let mut past = self.evict_if_full().unwrap_or_default();
         past.outcome = *outcome;
@@ -70,8 +63,6 @@ impl History {
         self.keep(past);
     }
 
-    /// Appends a step that is already in sparse form, and drops the oldest steps while the history exceeds its
-    /// capacity.
     pub fn keep(&mut self, past: PastStep) {
         self.n_bytes += past.n_bytes();
         self.steps.push_back(past);
@@ -94,17 +85,14 @@ impl History {
         Some(past)
     }
 
-    /// Returns the size of all frames, in bytes.
     pub fn n_bytes(&self) -> usize {
         self.n_bytes
     }
 
-    /// Returns the kept steps, from the oldest to the current one.
     pub fn all(&self) -> impl ExactSizeIterator<Item = &PastStep> {
         self.steps.iter()
     }
 
-    /// Returns the outcomes and frames of step k, if they are kept.
     pub fn step(&self, step: u64) -> Option<&PastStep> {
         let oldest = self.steps.front()?.outcome.step;
         self.steps
@@ -120,7 +108,6 @@ impl PastStep {
 }
 
 impl PastRobot {
-    /// Creates an entry with empty buffers, to be filled by [`Self::set`].
     fn blank() -> Self {
         Self {
             outcome: RobotOutcome::at(Cell { row: 0, col: 0 }),

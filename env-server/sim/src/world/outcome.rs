@@ -7,7 +7,6 @@ use emberwatch_model::{Cell, Coverage};
 pub struct WorldOutcome {
     /// Step index k after the step; 0 after a reset.
     pub step: u64,
-    /// The episode's seed.
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
@@ -22,11 +21,8 @@ pub struct WorldOutcome {
     pub n_target_cells: u32,
     /// Number of distinct cells that the robots visited.
     pub n_visited: u32,
-    /// Number of distinct rewarded cells whose state has the highest reward.
     pub n_hits: u32,
-    /// Whether the episode reached a terminal state.
     pub is_terminated: bool,
-    /// Whether the episode reached its last step.
     pub is_truncated: bool,
 }
 
@@ -43,7 +39,6 @@ pub struct RobotOutcome {
     pub n_hits: u32,
     /// The cell where the robot's path started, or where the robot stayed.
     pub start: Cell,
-    /// The robot's current cell.
     pub cell: Cell,
     pub coverage: Coverage,
     /// Number of moves flown; 0 after a reset and for a robot that stayed.
@@ -51,7 +46,6 @@ pub struct RobotOutcome {
 }
 
 impl RobotOutcome {
-    /// Creates the outcome of a robot that stays in a cell.
     pub fn at(cell: Cell) -> Self {
         Self {
             reward: 0.0,

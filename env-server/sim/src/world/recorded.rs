@@ -6,7 +6,6 @@ use emberwatch_model::{Grid, Shape};
 use ndarray::{Array3, ArrayView2, Axis};
 use rand::RngExt;
 
-/// The recorded sequences that the worlds of a server show.
 #[derive(Debug)]
 pub struct Recorded {
     /// Each has shape `[K, H, W]`, row-major, with K at least 2.
@@ -17,7 +16,6 @@ pub struct Recorded {
     most_offset: u64,
 }
 
-/// What a seed selects from the recorded states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Choice {
     sequence: usize,
@@ -56,12 +54,10 @@ impl Recorded {
             .ok_or(possible)
     }
 
-    /// Returns the number of sequences.
     pub fn n_sequences(&self) -> usize {
         self.sequences.len()
     }
 
-    /// Returns the number of steps of the shortest possible episode.
     pub fn n_steps(&self) -> u64 {
         self.shortest() - 1 - self.most_offset
     }
@@ -82,9 +78,6 @@ impl Recorded {
     }
 
     /// Writes [`Self::states`] into an existing grid.
-    ///
-    /// # Panics
-    /// If the episode ends before the step.
     pub(super) fn show(&self, seed: u64, step: u64, states: &mut Grid<u8>) {
         let choice = self.choice(seed);
         let recorded = self.sequences[choice.sequence].view();
@@ -131,7 +124,10 @@ fn turned(states: ArrayView2<'_, u8>, symmetry: u64) -> ArrayView2<'_, u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::array;
+    use crate::world::hidden::{Source, World};
+    use ndarray::{Axis, array};
+    use std::sync::Arc;
+    use std::sync::atomic::AtomicBool;
 
     fn recorded(lengths: &[usize], (height, width): (usize, usize), symmetries: bool) -> Recorded {
         let sequence = |(index, &length): (usize, &usize)| {
@@ -176,6 +172,19 @@ mod tests {
                 assert_eq!(recorded.last_step(seed), 1 + seed % 2);
             }
         }
+    }
+
+    #[test]
+    fn a_world_shows_its_sequence_to_the_end() {
+        let recorded = Arc::new(recorded(&[4, 5], (1, 3), false));
+        let source = Source::Recorded(Arc::clone(&recorded));
+        let mut world = World::new(source, 7, 0, &AtomicBool::new(false));
+        for k in 0..4 {
+            let expected = recorded.sequences[1].index_axis(Axis(0), k);
+            assert_eq!(world.states(), expected);
+            world.advance();
+        }
+        assert_eq!(world.step(), recorded.last_step(7));
     }
 
     #[test]

@@ -3,7 +3,6 @@
 use super::outcome::RobotOutcome;
 use emberwatch_model::{Airspace, Cell, Coverage, Frame, Move};
 
-/// The state of a robot after a step or a reset.
 #[derive(Debug, Clone)]
 pub struct Robot {
     pub(super) outcome: RobotOutcome,
@@ -30,7 +29,6 @@ pub fn bytes_of_robot(n_moves: usize, most_seen: usize, n_cells: usize) -> usize
 }
 
 impl Robot {
-    /// Creates a robot at a cell, in its state after a reset.
     pub(super) fn at(airspace: &Airspace, cell: Cell) -> Self {
         let mut robot = Self {
             outcome: RobotOutcome::at(cell),
@@ -66,12 +64,10 @@ impl Robot {
         };
     }
 
-    /// Returns the robot's outcome of the last step or reset.
     pub fn outcome(&self) -> &RobotOutcome {
         &self.outcome
     }
 
-    /// Returns the frame of the last step.
     pub fn frame(&self) -> &Frame {
         &self.frame
     }
@@ -81,7 +77,6 @@ impl Robot {
         &self.path
     }
 
-    /// Returns the robot's current cell.
     pub fn cell(&self) -> Cell {
         self.outcome.cell
     }

@@ -13,7 +13,6 @@ use rand::RngExt;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// The model, the grid and the settings that all episodes of a server share.
 #[derive(Debug, Clone)]
 pub struct Rules {
     pub shape: Shape,
@@ -22,11 +21,8 @@ pub struct Rules {
     starts: Option<Arc<Vec<usize>>>,
     /// Reward of a distinct visited (or seen) cell, indexed by the cell's state.
     pub reward: Vec<f64>,
-    /// The state with the highest reward.
     pub target_state: u8,
-    /// Number of states S.
     pub n_states: usize,
-    /// Number of observations O.
     pub n_observations: usize,
     /// Number of steps simulated before k = 0.
     pub burn_in: u64,
@@ -35,9 +31,7 @@ pub struct Rules {
     pub start: Start,
     /// Number of latest steps, including the current one, whose frames are kept.
     pub history: usize,
-    /// Number of moves in a path.
     pub n_moves: usize,
-    /// Number of robots per world.
     pub n_robots: usize,
     /// Set when the worlds are no longer needed. Running burn-ins then stop at once, and the unfinished worlds must not
     /// be used.
@@ -47,7 +41,6 @@ pub struct Rules {
 }
 
 impl Rules {
-    /// Creates the rules for worlds of this model with one robot. Leaves `history` and `n_moves` at 0.
     pub fn new(
         model: &Model,
         shape: Shape,
@@ -76,7 +69,6 @@ impl Rules {
         })
     }
 
-    /// Replaces the simulation with recorded hidden states.
     pub fn with_recorded(mut self, recorded: Arc<Recorded>) -> Self {
         self.source = Source::Recorded(recorded);
         self

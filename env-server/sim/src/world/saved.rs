@@ -24,7 +24,6 @@ pub struct SavedWorld {
     pub history: Vec<PastStep>,
 }
 
-/// One robot of a saved world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedRobot {
     /// The robot's outcome of the last step, which contains its position.
@@ -33,13 +32,11 @@ pub struct SavedRobot {
     pub path: Vec<u8>,
 }
 
-/// An error in a saved world: what was expected and what was found.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("{0}")]
 pub struct InvalidWorld(pub String);
 
 impl SavedWorld {
-    /// Checks that every value is valid for an episode.
     pub fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
         let n_cells = rules.shape.n_cells();
         for (what, states) in [

@@ -18,7 +18,6 @@ pub struct Sensor {
 }
 
 impl Sensor {
-    /// Creates the sensor of a model.
     pub fn new(model: &Model) -> Self {
         let n_observations = model.n_observations();
         let cumulative = |row: &[f64]| {

@@ -9,7 +9,6 @@ use std::fmt::{Display, Formatter};
 /// The number of free cells, and of those that robots cannot reach because of no-fly cells.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Reach {
-    /// Number of free cells.
     pub n_free: usize,
     /// Number of free cells outside the largest connected part. Random starts lie only inside that part.
     pub n_cut_off: usize,
@@ -17,7 +16,6 @@ pub struct Reach {
     pub closed_in: Vec<ClosedIn>,
 }
 
-/// A fixed start outside the largest connected part of the free cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClosedIn {
     cell: Cell,
@@ -106,7 +104,6 @@ pub(super) fn random_starts(airspace: &Airspace) -> Option<Vec<usize>> {
     (!airspace.is_open()).then(|| Parts::of(airspace).starts())
 }
 
-/// Returns the start cell of a robot, or `None` if starts are random.
 pub(super) fn fixed_start(start: Start, shape: Shape, robot: usize) -> Option<Cell> {
     match start {
         Start::Corner => Some(corner_or_side(shape, robot)),
@@ -172,6 +169,38 @@ mod tests {
         assert!(reach(Start::Random).closed_in.is_empty());
         let open = Reach::of(Start::Corner, &Airspace::open(shape), 2);
         assert_eq!(open.map(|it| it.cut_off()), Ok(None));
+    }
+
+    #[test]
+    fn starts_that_no_robot_can_leave_are_refused() {
+        let shape = Shape::new(3, 6).expect("a shape");
+        for (rows, start, expected, got) in [
+            (
+                ["#.....", "......", "......"],
+                Start::Corner,
+                "robots may be",
+                "(0, 0), a no-fly",
+            ),
+            (
+                [".#....", "#.....", "......"],
+                Start::Corner,
+                "can leave",
+                "(0, 0), which no-fly",
+            ),
+            (
+                ["#.#.#.", ".#.#.#", "#.#.#."],
+                Start::Random,
+                "can leave",
+                "no two adjacent",
+            ),
+        ] {
+            let airspace = model(rows).airspace(shape).expect("the grid");
+            let refused = Reach::of(start, &airspace, 1).expect_err(got);
+            assert!(
+                refused[0].contains(expected) && refused[1].contains(got),
+                "{refused:?}"
+            );
+        }
     }
 
     #[test]

@@ -9,18 +9,14 @@ const UNLIMITED: u64 = 1 << 60;
 /// A cgroup controller, such as `memory`. Each of its files has one name in version 1 and another in version 2.
 pub(super) struct Controller {
     pub(super) name: &'static str,
-    /// The file with the limit of the cgroup.
     pub(super) limit: [&'static str; 2],
-    /// The file with the current use.
     pub(super) used: [&'static str; 2],
     /// Entries of `memory.stat` that count reclaimable memory, such as cached files.
     pub(super) reclaimable: [&'static [&'static str]; 2],
 }
 
-/// The limit of one cgroup.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct CgroupLimit {
-    /// The file with the limit.
     pub(super) file: PathBuf,
     pub(super) limit: u64,
     pub(super) free: u64,
@@ -87,7 +83,6 @@ fn own_group(own: &str, mount: &Mount, controller: &Controller) -> Option<PathBu
     is_plain.then(|| below.to_owned())
 }
 
-/// Returns the limit of one cgroup, if it has one.
 fn limit(folder: &Path, version: usize, controller: &Controller) -> Option<CgroupLimit> {
     let number = |name: &str| {
         let text = std::fs::read_to_string(folder.join(name)).ok()?;

@@ -17,13 +17,11 @@ const CGROUP: Controller = Controller {
     ],
 };
 
-/// The error for a request for more memory than is available.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("memory: expected {} for {what}, got {got}", in_words(*.needed))]
 pub struct NoMemory {
     what: String,
     needed: u64,
-    /// The available memory, the limit that applies, and what to do.
     got: String,
 }
 
@@ -31,7 +29,6 @@ pub struct NoMemory {
 #[derive(Debug, PartialEq, Eq)]
 struct Limit {
     free: u64,
-    /// The amount of the limit, its name, and how to raise it.
     words: String,
 }
 
@@ -73,7 +70,6 @@ pub fn with_capacity<T>(what: impl Display, capacity: usize) -> Result<Vec<T>, N
     }
 }
 
-/// Checks as [`check`] does, but reads the limits from the files below `root`.
 fn check_below(root: &Path, what: &impl Display, needed: u64) -> Result<(), NoMemory> {
     let limits = limits(root).into_iter();
     let tightest = limits.min_by_key(|limit| limit.free);
@@ -87,7 +83,6 @@ fn check_below(root: &Path, what: &impl Display, needed: u64) -> Result<(), NoMe
     })
 }
 
-/// Returns all limits that can be read.
 fn limits(root: &Path) -> Vec<Limit> {
     let of_cgroup = |it: cgroups::CgroupLimit| Limit {
         free: it.free,
@@ -123,7 +118,6 @@ fn of_process(_root: &Path) -> Vec<Limit> {
     Vec::new()
 }
 
-/// Returns the limits that `ulimit` sets.
 #[cfg(target_os = "linux")]
 fn of_process(root: &Path) -> Vec<Limit> {
     let text = std::fs::read_to_string(root.join("proc/self/status")).unwrap_or_default();

@@ -21,14 +21,11 @@ const THREAD_BYTES: u64 = 4 << 20;
 const REFUSED: &str = "the seccomp profile of the container forbids `clone3`; allow it, or let it fail with ENOSYS (Docker \
                        does since 20.10.10; --security-opt seccomp=PROFILE)";
 
-/// The error for threads that could not be started.
 #[derive(Debug, thiserror::Error)]
 #[error("threads: expected to start {n_threads}, got: {problem}; {reason}")]
 pub struct NoThreads {
     n_threads: usize,
-    /// The system's error.
     problem: String,
-    /// The limit, and what to do.
     reason: String,
 }
 

@@ -31,9 +31,7 @@ pub const MAX_STORED_BYTES: usize = MAX_BODY_BYTES + MAX_BODY_BYTES / 1024 + 64;
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct FileHeader {
-    /// [`MAGIC`].
     pub magic: [u8; 8],
-    /// One of [`VERSIONS`].
     pub version: u32,
     /// Reserved; always 0.
     pub reserved: u32,
@@ -45,7 +43,6 @@ pub struct FileHeader {
 pub struct RecordHeader {
     /// Time in nanoseconds since the recording began; never less than in the previous record.
     pub nanos: u64,
-    /// A [`Kind`].
     pub kind: u32,
     /// Size of the stored body in bytes.
     pub length: u32,
@@ -55,7 +52,6 @@ pub struct RecordHeader {
     pub checksum: u32,
 }
 
-/// The kind of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Kind {
@@ -69,7 +65,6 @@ pub enum Kind {
     End = 4,
 }
 
-/// A checked record.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
     /// Time in nanoseconds since the recording began; never less than in the previous record.
@@ -81,7 +76,6 @@ pub struct Record {
     pub event: Event,
 }
 
-/// The content of a record.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
     /// The server that published the following samples.
@@ -95,11 +89,8 @@ pub enum Event {
 /// Counts of the records in a recording, and of the samples that its recorder missed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Totals {
-    /// Number of servers.
     pub n_servers: u64,
-    /// Number of frames.
     pub n_frames: u64,
-    /// Number of hidden states.
     pub n_truths: u64,
     /// Number of frames that the recorder missed.
     pub n_lost_frames: u64,
@@ -111,7 +102,6 @@ pub struct Totals {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecordingError {
-    /// The system returned an error.
     #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The file is not a recording, or its format has another version or byte order.
@@ -128,7 +118,6 @@ pub enum RecordingError {
         offset: u64,
         /// Number of bytes after the last complete record.
         got: u64,
-        /// Number of world steps in the complete records.
         n_steps: u64,
     },
     /// The file contains bytes that no recorder wrote. All records up to `offset` are complete.
@@ -138,9 +127,7 @@ pub enum RecordingError {
     Damaged {
         /// Offset in the file where the damaged record begins, in bytes.
         offset: u64,
-        /// What was expected and what was found.
         problem: String,
-        /// Number of world steps in the complete records.
         n_steps: u64,
     },
     /// A record does not fit the previous records, so it was not written.
@@ -148,7 +135,6 @@ pub enum RecordingError {
     Refused(String),
 }
 
-/// Returns the checksum of a record.
 pub(super) fn checksum(header: &RecordHeader, stored: &[u8]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
     let bytes = bytemuck::bytes_of(header);

@@ -13,18 +13,15 @@ use std::fmt::Display;
 /// the other would reject.
 #[derive(Debug, Default)]
 pub(super) struct Progress {
-    /// Protocol version of the samples.
     pub(super) version: u32,
     pub(super) nanos: u64,
     server: Option<Limits>,
     pub(super) totals: Totals,
     /// Episode and step of each world's last frame. A frame may be published more than once.
     last: HashMap<u32, (u64, u64)>,
-    /// Number of world steps.
     pub(super) n_steps: u64,
 }
 
-/// The sizes that a server's samples must fit.
 #[derive(Debug, Clone)]
 struct Limits {
     n_worlds: u32,
@@ -35,7 +32,6 @@ struct Limits {
 }
 
 impl Progress {
-    /// Creates the state of a recording without records.
     pub(super) fn new(version: u32) -> Self {
         Self {
             version,

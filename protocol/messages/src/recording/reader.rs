@@ -68,12 +68,10 @@ impl<R: Read> Reader<R> {
         })
     }
 
-    /// Returns the totals of the records read so far.
     pub fn totals(&self) -> Totals {
         self.progress.totals
     }
 
-    /// Reads the next record, or `None` at the end.
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
         let (offset, n_steps) = (self.offset, self.progress.n_steps);
         let mut header = RecordHeader::zeroed();
@@ -153,7 +151,6 @@ impl<R: Read> Iterator for Reader<R> {
     }
 }
 
-/// Reads a value's bytes, and returns the number of bytes read.
 fn fill<T: Pod>(input: &mut impl Read, value: &mut T) -> Result<usize, std::io::Error> {
     let bytes = bytemuck::bytes_of_mut(value);
     let mut n_read = 0;

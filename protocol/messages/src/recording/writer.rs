@@ -77,15 +77,10 @@ impl<W: Write> Writer<W> {
         self.append(kind, record.nanos, record.n_lost)
     }
 
-    /// Flushes everything written so far to the system.
-    ///
-    /// # Errors
-    /// If the system returns an error.
     pub fn flush(&mut self) -> Result<(), RecordingError> {
         Ok(self.output.flush()?)
     }
 
-    /// Returns the number of bytes written so far.
     pub fn n_bytes(&self) -> u64 {
         self.n_bytes
     }
@@ -103,7 +98,6 @@ impl<W: Write> Writer<W> {
         Ok(totals)
     }
 
-    /// Compresses the body and writes the record.
     fn append(&mut self, kind: Kind, nanos: u64, n_lost: u32) -> Result<(), RecordingError> {
         if self.body.len() > MAX_BODY_BYTES {
             let got = self.body.len();

@@ -37,7 +37,6 @@ impl Buffers {
         }
     }
 
-    /// Returns the size of the buffers in bytes.
     pub(super) fn n_bytes(model: &Model, shape: Shape) -> usize {
         let (n_places, n_homes) = Places::lengths(model, shape);
         let in_band = n_homes.min(BAND);

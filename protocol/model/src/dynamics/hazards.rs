@@ -30,7 +30,6 @@ const MARGIN: f64 = 1.0 + 1e-6;
 pub(super) struct Tables {
     /// For each state that can change, a bound of the probability with which it does.
     bounds: Vec<Bound>,
-    /// The transitions of each state.
     changes: Vec<Changes>,
     /// The offset of a cell from its home.
     centre: usize,
@@ -57,7 +56,6 @@ struct Neighbour {
 #[derive(Debug)]
 struct Counts(Vec<u8>);
 
-/// The transitions of cells in one state.
 #[derive(Debug)]
 struct Changes {
     /// The offsets from a cell's home to the neighbours that influence it.
@@ -98,7 +96,6 @@ impl Tables {
         }
     }
 
-    /// Writes the next states of the cells in all bands.
     #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
     pub(super) fn advance(&self, keys: Keys, buffers: &mut Buffers) {
         for band in buffers.bands() {
@@ -141,7 +138,6 @@ impl Tables {
         }
     }
 
-    /// Draws the next states of the listed cells.
     #[inline(never)] // For the same reason as `Buffers::list_marked`.
     fn draw(&self, listed: &[u32], [byte_key, draw_key]: Keys, places: &mut Places) {
         for &home in listed {
@@ -223,13 +219,11 @@ struct Homes<'a> {
 }
 
 impl Homes<'_> {
-    /// Returns the offset from a cell's home to a neighbour.
     fn offset(&self, [row, col]: [isize; 2]) -> usize {
         let offset = row * self.places.stride as isize + col;
         self.places.centre().wrapping_add_signed(offset)
     }
 
-    /// Returns the cells with their homes.
     fn cells(&self) -> impl Iterator<Item = (Cell, usize)> {
         let cells = (0..self.shape.n_cells()).map(|index| self.shape.cell(index));
         cells.map(|cell| (cell, self.places.home(cell.row, cell.col)))

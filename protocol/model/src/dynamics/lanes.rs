@@ -83,7 +83,6 @@ pub(super) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     *lanes = states;
 }
 
-/// Returns the [`LANES`] states that begin at a place.
 #[inline(always)]
 pub(super) fn lanes_from(states: &[u8], at: usize) -> &[u8; LANES] {
     let lanes = states[at..].first_chunk();

@@ -42,18 +42,15 @@ impl<'k> Mixture<'k> {
         self.kernel.n_states
     }
 
-    /// Returns the number of nonzero weights.
     pub(super) fn n_weights(&self) -> usize {
         let weights = self.kernel.weights.iter();
         weights.filter(|&&weight| weight > 0.0).count()
     }
 
-    /// Returns `f`.
     pub(super) fn likeliest(&self) -> &[usize] {
         &self.likeliest
     }
 
-    /// Returns, for each tap, the number of byte values (of 256) that stand for it.
     pub(super) fn counts(&self) -> &[usize] {
         &self.counts
     }

@@ -46,18 +46,15 @@ impl Places {
         (n_places, n_homes)
     }
 
-    /// Returns the home of a cell.
     pub(super) fn home(&self, row: usize, col: usize) -> usize {
         row * self.stride + col
     }
 
-    /// Returns the offset of a cell from its home.
     pub(super) fn centre(&self) -> usize {
         let [above, left] = self.margins;
         above * self.stride + left
     }
 
-    /// Copies the states of the grid's cells into the places between the margins.
     #[inline(always)]
     pub(super) fn load(&mut self, cells: &[u8]) {
         let ([above, left], width) = (self.margins, self.width);
@@ -67,7 +64,6 @@ impl Places {
         }
     }
 
-    /// Copies the next states to the grid's cells.
     #[inline(always)]
     pub(super) fn store(&self, cells: &mut [u8]) {
         let rows = self.next.chunks(self.stride);
