@@ -8,7 +8,8 @@ choice matters on `burnout` and `latent`. On the belief of a learned filter:
         --burn-in 6000 --out filter
     python sb3_objective.py --checkpoint filter/checkpoint.safetensors
 
-`emberwatch-agent compare --policies options` scores every plan alone on the same test worlds.
+`emberwatch-agent compare --policies learned/options/exploit,learned/options/entropy` scores plans
+alone on the same test worlds.
 """
 
 from __future__ import annotations
