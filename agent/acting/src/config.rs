@@ -153,7 +153,11 @@ fn replace(settings: &mut Table, by: Table, section: &str) -> Result<()> {
 fn check_constant(name: &str, got: &str) -> Result<()> {
     match CONSTANTS.iter().find(|constant| constant.0 == name) {
         Some((_, expected)) => ensure!(
-            got == *expected,
+            got == *expected
+                || got
+                    .parse::<f64>()
+                    .ok()
+                    .is_some_and(|it| expected.parse() == Ok(it)),
             "{name}: expected {expected}, which is constant, got {got}"
         ),
         None => bail!("{name}: expected a known setting"),

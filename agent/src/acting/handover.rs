@@ -86,8 +86,10 @@ pub fn take_over_left(
     let Some(kind) = acting.agent.handover_kind() else {
         return Ok(false);
     };
-    let Some(left) = client.left_belief(number, &kind)? else {
-        return Ok(false);
+    let left = match client.left_belief(number, &kind) {
+        Ok(Some(left)) => left,
+        Ok(None) | Err(ConnectionError::Refused { .. }) => return Ok(false),
+        Err(error) => return Err(error),
     };
     let is_taken = acting.agent.take_over(&left);
     if is_taken {

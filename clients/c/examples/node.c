@@ -12,8 +12,7 @@ static ew_error error;
 
 // Attaches to the instance, and acquires robot 0 to continue the episode.
 static int32_t begin(const char *instance, const ew_answer **seen) {
-    ew_free(lease);
-    ew_free(server);
+    ew_free(lease), ew_free(server);
     lease = NULL;
     server = NULL;
     int32_t code = ew_attach(instance, "node.c", 1, 1, &server, &error);
@@ -45,7 +44,8 @@ int main(int argc, char **argv) {
         }
         if (code != 0) {
             fprintf(stderr, "step %d: %d, %s\n", step, (int)code, error.message);
-            seen = NULL; // Begins again.
+            seen = NULL; // Begins again, without the steps that were missed.
+            clock_gettime(CLOCK_MONOTONIC, &next);
         }
         next.tv_nsec += 100000000;
         next.tv_sec += next.tv_nsec / 1000000000;

@@ -36,7 +36,7 @@
 
 
 // Maximum number of moves in a path: 4096.
-#define MAX_MOVES 4096
+#define EW_MAX_MOVES 4096
 
 // Failure: the handle belongs to the process that forked this one.
 #define EW_FAILURE_FORKED -12
@@ -515,9 +515,6 @@ typedef struct ew_left {
 
 // Returns true to end a wait.
 typedef bool (*ew_interrupt_check)(void);
-
-// All moves, in the order of their wire values.
-#define ew_move_ALL { ew_move_Up, ew_move_Down, ew_move_Left, ew_move_Right, }
 
 #ifdef __cplusplus
 extern "C" {

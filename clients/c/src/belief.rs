@@ -46,12 +46,17 @@ pub struct Left {
     pub step: u64,
 }
 
-/// Converts what C says about a belief of `n_states` states.
 fn intent_of(core: &Core, n_states: usize, given: &Intent) -> Outcome<WireIntent> {
     let words = |given: *const c_char| match given.is_null() {
         true => Ok(String::new()),
-        false => text("intent", given).map(String::from),
+        false => match text("intent", given)? {
+            text if text.len() <= 256 => Ok(text.to_owned()),
+            text => Err(invalid("intent", "texts of at most 256 bytes", text.len())),
+        },
     };
+    if !given.plan_millis.is_finite() || given.plan_millis < 0.0 {
+        return Err(invalid("plan_millis", "at least 0", given.plan_millis));
+    }
     let states = if given.states.is_null() {
         core.state_names(n_states)
     } else {
@@ -97,6 +102,9 @@ pub extern "C" fn ew_publish_belief(
         }
         let dim = (n_states as usize, info.height, info.width);
         let numbers = array("belief", belief, dim.0 * dim.1 * dim.2)?;
+        if let Some(got) = numbers.iter().find(|p| !(0.0..=1.0).contains(*p)) {
+            return Err(invalid("belief", "probabilities", got));
+        }
         let Some(instance) = &core.instance else {
             return Ok(());
         };
@@ -148,7 +156,7 @@ pub extern "C" fn ew_leave_belief(
         let lease = of(lease)?;
         let (_, at) = lease.last_result(robot)?;
         let (kind, bytes) = (text("kind", kind)?, array("bytes", bytes, n_bytes)?);
-        let (place, limit) = ((lease.number(), robot), duration(timeout));
+        let (place, limit) = ((lease.number(), robot), duration("timeout", timeout)?);
         Ok(lease
             .core
             .with(|backend| left_belief::leave(backend, place, &at, kind, bytes, limit))?)
@@ -167,7 +175,7 @@ pub extern "C" fn ew_left_belief(
 ) -> i32 {
     guard(error, || {
         let server = of(server)?;
-        let limit = duration(timeout);
+        let limit = duration("timeout", timeout)?;
         let left = server
             .core
             .with(|backend| left_belief::load(backend, robot, None, limit))?;

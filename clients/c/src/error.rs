@@ -31,7 +31,7 @@ pub struct ErrorInfo {
 pub struct Error {
     code: i32,
     detail: u64,
-    message: String,
+    pub message: String,
 }
 
 pub type Outcome<T = ()> = Result<T, Error>;
@@ -51,7 +51,6 @@ impl Error {
     }
 }
 
-/// Returns the error for an invalid argument.
 pub fn invalid(what: &str, expected: impl Display, got: impl Display) -> Error {
     let text = format!("{what}: expected {expected}, got {got}");
     Error::of_class(ErrorClass::Invalid, text)

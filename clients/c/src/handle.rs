@@ -24,7 +24,6 @@ struct Tag {
     free: fn(*mut c_void, bool),
 }
 
-/// Gives a handle to C, which sees an opaque pointer.
 pub fn give<T: Send + 'static>(value: T, to: *mut *mut T) -> Outcome {
     let tag = Tag {
         kind: TypeId::of::<T>(),
@@ -38,15 +37,22 @@ pub fn give<T: Send + 'static>(value: T, to: *mut *mut T) -> Outcome {
     Ok(())
 }
 
-/// Returns what C's handle points to.
 pub fn of<'a, T: 'static>(handle: *mut T) -> Outcome<&'a T> {
-    let expected = type_name::<T>();
+    let expected = match type_name::<T>() {
+        name if name.ends_with("Server") => "an ew_server",
+        name if name.ends_with("LeaseHandle") => "an ew_lease",
+        _ => "an ew_samples",
+    };
     // SAFETY: the caller passes null or a handle that it has not freed, and a handle begins with its tag.
     let Some(tag) = (unsafe { handle.cast::<Tag>().as_ref() }) else {
         return Err(invalid("handle", expected, "NULL"));
     };
     if tag.kind != TypeId::of::<T>() {
-        return Err(invalid("handle", expected, "a handle of another kind"));
+        return Err(invalid(
+            "handle",
+            expected,
+            "another kind of handle, or one that was freed",
+        ));
     }
     if tag.pid != std::process::id() {
         let text = "this handle belongs to the process that forked this one: make a new one here";
@@ -76,7 +82,6 @@ pub fn put<T>(to: *mut T, value: T) {
     }
 }
 
-/// Returns a text that C passed.
 pub fn text<'a>(what: &str, given: *const c_char) -> Outcome<&'a str> {
     if given.is_null() {
         return Err(invalid(what, "a text", "NULL"));
@@ -88,21 +93,27 @@ pub fn text<'a>(what: &str, given: *const c_char) -> Outcome<&'a str> {
         .map_err(|error| invalid(what, "UTF-8", error))
 }
 
-/// Returns an array that C passed.
 pub fn array<'a, T>(what: &str, given: *const T, n: usize) -> Outcome<&'a [T]> {
     if n == 0 {
         return Ok(&[]);
     }
-    if given.is_null() {
-        return Err(invalid(what, format!("{n} values"), "NULL"));
+    if given.is_null() || n > isize::MAX as usize / size_of::<T>() {
+        let got = if given.is_null() {
+            "NULL"
+        } else {
+            "more than memory has"
+        };
+        return Err(invalid(what, format!("{n} values"), got));
     }
     // SAFETY: the caller passes `n` values, which it does not change during the call.
     Ok(unsafe { std::slice::from_raw_parts(given, n) })
 }
 
-/// Converts a timeout in seconds. Negative numbers and NaN become 0.
-pub fn duration(seconds: f64) -> Duration {
-    Duration::try_from_secs_f64(seconds.clamp(0.0, 1e9)).unwrap_or_default()
+pub fn duration(what: &str, seconds: f64) -> Outcome<Duration> {
+    if seconds.is_nan() || seconds < 0.0 {
+        return Err(invalid(what, "seconds of at least 0", seconds));
+    }
+    Ok(Duration::try_from_secs_f64(seconds.min(1e9)).unwrap_or_default())
 }
 
 /// Frees any handle of this library; NULL does nothing. Handles may be freed in any order: a connection closes when its

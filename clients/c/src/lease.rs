@@ -1,7 +1,7 @@
 //! Leases: the right to fly consecutive robots.
 
 use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
-use crate::handle::{array, duration, give, hold, of};
+use crate::handle::{array, duration, give, hold, of, put};
 use crate::server::{Core, Server};
 use crate::view::{View, keep};
 use emberwatch_messages::backend::StepAnswer;
@@ -13,7 +13,9 @@ use emberwatch_messages::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, WorldResult, worlds_of,
 };
 use emberwatch_messages::payload::split_step_payload;
+use emberwatch_model::path::{MoveError, check_moves};
 use std::ops::Range;
+use std::ptr::null_mut;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -33,8 +35,8 @@ pub struct LeaseHandle {
     pub core: Arc<Core>,
     pub robots: Range<u32>,
     lease: Lease,
-    /// The last answer, to which C has a pointer.
-    last: Mutex<Option<AnswerView>>,
+    /// The last answer, to which C has a pointer, and the results of the last one that was no recall.
+    last: Mutex<(Option<AnswerView>, Vec<WorldResult>)>,
 }
 
 /// The results of worlds and robots, and the frames.
@@ -87,7 +89,7 @@ impl LeaseHandle {
         let world = worlds_of(robot, 1, self.core.info.n_robots).start;
         let index = (world - self.lease.worlds().start) as usize;
         let last = hold(&self.last)?;
-        let result = last.as_ref().and_then(|answer| answer.owned.0.get(index));
+        let result = last.1.get(index);
         let missing = || invalid("belief", "ew_reset, ew_step or ew_observe before", "none");
         Ok((world, *result.ok_or_else(missing)?))
     }
@@ -122,7 +124,6 @@ impl LeaseHandle {
         self.core.with(|backend| self.lease.send(backend, call))
     }
 
-    /// Asks for the results and frames of an earlier step, or for the last ones.
     fn look(&self, step: Option<u64>, flags: u32, limit: Duration) -> Outcome<Seen> {
         let operation = step.map_or(Operation::Observe, |_| Operation::Recall);
         let request = self.lease.request(operation, &self.robots, flags);
@@ -133,16 +134,14 @@ impl LeaseHandle {
     fn reset(&self, seeds: *const u64, n_seeds: usize, limit: Duration) -> Outcome<Seen> {
         let start = Instant::now();
         let worlds = self.lease.worlds();
-        let given = if seeds.is_null() {
-            vec![None; worlds.len()]
-        } else {
-            let seeds = array("seeds", seeds, n_seeds)?;
-            seeds.iter().copied().map(Some).collect()
-        };
-        if given.len() != worlds.len() {
-            let expected = format!("{} seeds", worlds.len());
-            return Err(invalid("seeds", expected, given.len()));
+        if n_seeds != (if seeds.is_null() { 0 } else { worlds.len() }) {
+            let expected = format!("{} seeds, or NULL and 0", worlds.len());
+            return Err(invalid("seeds", expected, n_seeds));
         }
+        let given = match array("seeds", seeds, n_seeds)? {
+            [] => vec![None; worlds.len()],
+            seeds => seeds.iter().copied().map(Some).collect(),
+        };
         let worlds = worlds.zip(given);
         let worlds = worlds.map(|(world, seed)| WorldSeed { world, seed });
         self.core
@@ -163,9 +162,19 @@ impl LeaseHandle {
             return Err(invalid("paths", expected, n));
         }
         let moves = array("paths", moves, n)?;
+        if let Err(MoveError { index, value }) = check_moves(moves) {
+            let (robot, index) = (
+                self.robots.start as usize + index / n_moves,
+                index % n_moves,
+            );
+            let got = format!("{value} for move {index} of robot {robot}");
+            return Err(invalid("paths", "moves 0 to 3", got));
+        }
         let (accepts_late, flags) = (flags & EW_ACCEPT_LATE != 0, flags & !EW_ACCEPT_LATE);
         let request = self.lease.request(Operation::Step, &self.robots, flags);
-        let paths = Call::new(request, moves, limit.min(STEP_TIMEOUT));
+        // A long wait is cut into equal parts, after each of which the lease asks whether the worlds have moved.
+        let n_parts = limit.as_secs_f64().div_euclid(STEP_TIMEOUT.as_secs_f64()) as u32 + 1;
+        let paths = Call::new(request, moves, limit / n_parts);
         let send = |call: &mut Call<'_>| self.send(call);
         let is_over = || Ok(start.elapsed() >= limit);
         let flown = self.lease.send_paths(paths, accepts_late, send, is_over)?;
@@ -184,17 +193,21 @@ impl Drop for LeaseHandle {
     }
 }
 
-/// Asks for an answer and keeps it for C.
 fn answer(
     lease: *mut LeaseHandle,
     out: *mut *const Answer,
     error: *mut ErrorInfo,
+    is_recall: bool,
     ask: impl FnOnce(&LeaseHandle) -> Outcome<Seen>,
 ) -> i32 {
     guard(error, || {
         let lease = of(lease)?;
         let mut last = hold(&lease.last)?;
-        keep(&mut last, lease.view(ask(lease)?)?, out);
+        let view = lease.view(ask(lease)?)?;
+        if !is_recall {
+            last.1.clone_from(&view.owned.0);
+        }
+        keep(&mut last.0, view, out);
         Ok(())
     })
 }
@@ -214,14 +227,19 @@ pub extern "C" fn ew_acquire(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
+        put(out, null_mut());
         let core = of(server)?.core.clone();
+        let (limit, life) = (
+            duration("timeout", timeout)?,
+            duration("seconds_to_live", seconds_to_live)?,
+        );
         let robots = first_robot..first_robot.saturating_add(n_robots);
         let claim = Claim {
             robots: robots.clone(),
             takeover,
-            time_to_live: Some(duration(seconds_to_live)).filter(|life| !life.is_zero()),
+            time_to_live: Some(life).filter(|life| !life.is_zero()),
         };
-        let (lease, _) = core.with(|it| Lease::acquire(it, &claim, duration(timeout)))?;
+        let (lease, _) = core.with(|it| Lease::acquire(it, &claim, limit))?;
         let lease = LeaseHandle {
             core,
             robots,
@@ -244,8 +262,8 @@ pub extern "C" fn ew_reset(
     out: *mut *const Answer,
     error: *mut ErrorInfo,
 ) -> i32 {
-    answer(lease, out, error, |lease| {
-        lease.reset(seeds, n_seeds, duration(timeout))
+    answer(lease, out, error, false, |lease| {
+        lease.reset(seeds, n_seeds, duration("timeout", timeout)?)
     })
 }
 
@@ -263,8 +281,8 @@ pub extern "C" fn ew_step(
     out: *mut *const Answer,
     error: *mut ErrorInfo,
 ) -> i32 {
-    answer(lease, out, error, |lease| {
-        lease.fly(paths, n_bytes, flags, duration(timeout))
+    answer(lease, out, error, false, |lease| {
+        lease.fly(paths, n_bytes, flags, duration("timeout", timeout)?)
     })
 }
 
@@ -277,8 +295,8 @@ pub extern "C" fn ew_observe(
     out: *mut *const Answer,
     error: *mut ErrorInfo,
 ) -> i32 {
-    answer(lease, out, error, |lease| {
-        lease.look(None, flags, duration(timeout))
+    answer(lease, out, error, false, |lease| {
+        lease.look(None, flags, duration("timeout", timeout)?)
     })
 }
 
@@ -293,8 +311,8 @@ pub extern "C" fn ew_recall(
     out: *mut *const Answer,
     error: *mut ErrorInfo,
 ) -> i32 {
-    answer(lease, out, error, |lease| {
-        lease.look(Some(step), flags, duration(timeout))
+    answer(lease, out, error, true, |lease| {
+        lease.look(Some(step), flags, duration("timeout", timeout)?)
     })
 }
 
@@ -303,9 +321,8 @@ pub extern "C" fn ew_recall(
 pub extern "C" fn ew_renew(lease: *mut LeaseHandle, timeout: f64, error: *mut ErrorInfo) -> i32 {
     guard(error, || {
         let lease = of(lease)?;
-        Ok(lease
-            .core
-            .with(|worlds| lease.lease.renew(worlds, duration(timeout)))?)
+        let (_held, limit) = (hold(&lease.last)?, duration("timeout", timeout)?);
+        Ok(lease.core.with(|it| lease.lease.renew(it, limit))?)
     })
 }
 
@@ -314,8 +331,7 @@ pub extern "C" fn ew_renew(lease: *mut LeaseHandle, timeout: f64, error: *mut Er
 pub extern "C" fn ew_release(lease: *mut LeaseHandle, timeout: f64, error: *mut ErrorInfo) -> i32 {
     guard(error, || {
         let lease = of(lease)?;
-        Ok(lease
-            .core
-            .with(|worlds| lease.lease.release(worlds, duration(timeout)))?)
+        let (_held, limit) = (hold(&lease.last)?, duration("timeout", timeout)?);
+        Ok(lease.core.with(|it| lease.lease.release(it, limit))?)
     })
 }

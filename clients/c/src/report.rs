@@ -46,11 +46,9 @@ pub extern "C" fn ew_status_of(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
-        let server = of(server)?;
+        let (server, limit) = (of(server)?, duration("timeout", timeout)?);
         let request = Request::Status {};
-        let reply = server
-            .core
-            .with(|worlds| worlds.control(&request, duration(timeout)))?;
+        let reply = server.core.with(|it| it.control(&request, limit))?;
         let Reply::Status(status) = reply else {
             return Err(unexpected("status", &reply).into());
         };

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
 use crate::fork::watch_forks;
-use crate::handle::{duration, give, hold, of, text};
+use crate::handle::{duration, give, hold, of, put, text};
 use crate::info::{Info, view_of};
 use crate::view::{Texts, View, keep};
 use emberwatch_messages::agent_belief::AgentBelief;
@@ -17,6 +17,7 @@ use std::ffi::c_char;
 use std::fmt::Display;
 use std::fs::File;
 use std::io::BufReader;
+use std::ptr::null_mut;
 use std::sync::Mutex;
 use std::time::Duration;
 
@@ -97,14 +98,16 @@ pub struct Samples(Mutex<Reading>);
 
 impl Samples {
     fn of(source: Source) -> Self {
-        let last = None;
-        Self(Mutex::new(Reading { source, last }))
+        let (last, end) = (None, None);
+        Self(Mutex::new(Reading { source, last, end }))
     }
 }
 
 struct Reading {
     source: Source,
     last: Option<View<Sample, Memory>>,
+    /// Why a recording cannot be read further.
+    end: Option<String>,
 }
 
 enum Source {
@@ -176,7 +179,6 @@ fn belief(received: Received<AgentHeader>, to: &mut Sample) -> Outcome<Memory> {
     Ok(view)
 }
 
-/// Waits for the next sample of a channel.
 fn observed<H: Published>(
     observer: &Observer<H>,
     (world, limit): (Option<u32>, Duration),
@@ -190,7 +192,6 @@ fn observed<H: Published>(
     fill(received, to)
 }
 
-/// Reads the next record about a server or a world.
 fn recorded(
     reader: &mut Reader<BufReader<File>>,
     world: Option<u32>,
@@ -224,6 +225,7 @@ pub extern "C" fn ew_watch(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
+        put(out, null_mut());
         let instance = Instance::new(text("instance", instance)?)?;
         watch_forks();
         let source = match what {
@@ -244,9 +246,11 @@ pub extern "C" fn ew_open_recording(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
+        put(out, null_mut());
         let path = text("path", path)?;
         let file = File::open(path).map_err(|error| invalid(path, "a recording", error))?;
-        let reader = Box::new(Reader::new(BufReader::new(file))?);
+        let reader = Reader::new(BufReader::new(file));
+        let reader = Box::new(reader.map_err(|error| invalid(path, "a recording", error))?);
         give(Samples::of(Source::Recording(reader)), out)
     })
 }
@@ -263,15 +267,20 @@ pub extern "C" fn ew_next(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
-        let Reading { source, last } = &mut *hold(&of(samples)?.0)?;
-        let wanted = (u32::try_from(world).ok(), duration(timeout));
+        let Reading { source, last, end } = &mut *hold(&of(samples)?.0)?;
+        let wanted = (u32::try_from(world).ok(), duration("timeout", timeout)?);
         let mut sample = Sample::default();
         let to = &mut sample;
         let memory = match source {
             Source::Frames(observer) => observed(observer, wanted, to, frame)?,
             Source::Truths(observer) => observed(observer, wanted, to, truth)?,
             Source::Beliefs(observer) => observed(observer, wanted, to, belief)?,
-            Source::Recording(reader) => recorded(reader, wanted.0, to)?,
+            Source::Recording(reader) if end.is_none() => {
+                let read = recorded(reader, wanted.0, to);
+                *end = read.as_ref().err().map(|error| error.message.clone());
+                read?
+            }
+            Source::Recording(_) => return Err(bad(end.as_deref().unwrap_or_default())),
         };
         keep(last, View::new(sample, memory), out);
         Ok(())

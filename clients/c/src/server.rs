@@ -1,6 +1,6 @@
 //! Servers: running ones, and worlds in this process.
 
-use crate::error::{Error, ErrorInfo, Outcome, guard};
+use crate::error::{Error, ErrorInfo, Outcome, guard, invalid};
 use crate::fork::watch_forks;
 use crate::handle::{duration, give, of, put, text};
 use crate::info::{Info, InfoView, view_of};
@@ -15,7 +15,7 @@ use serde_json::{Map, Value};
 use std::any::{Any, TypeId};
 use std::collections::HashMap;
 use std::ffi::{CString, c_char};
-use std::ptr::null;
+use std::ptr::{null, null_mut};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// A connection to a server, or worlds in this process. Threads may share it; requests run one after another.
@@ -101,10 +101,11 @@ pub extern "C" fn ew_attach(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
+        put(out, null_mut());
         let instance = Instance::new(text("instance", instance)?)?;
         let client = text("client", client)?;
         watch_forks();
-        let limits = (duration(wait), duration(timeout));
+        let limits = (duration("wait", wait)?, duration("timeout", timeout)?);
         let connection = Connection::open_within(&instance, client, limits, |_| true)?;
         Server::give(Box::new(connection), Some(instance), out)
     })
@@ -119,6 +120,7 @@ pub extern "C" fn ew_embed(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
+        put(out, null_mut());
         let given: Map<String, Value> = toml::from_str(text("settings", settings)?)
             .map_err(|error| Error::of_class(ErrorClass::Invalid, error))?;
         watch_forks();
@@ -148,7 +150,7 @@ pub extern "C" fn ew_control(
 ) -> i32 {
     guard(error, || {
         let (server, request) = (of(server)?, text("request", request)?.as_bytes());
-        let limit = duration(timeout);
+        let limit = duration("timeout", timeout)?;
         let answer = CString::new(server.core.with(|it| it.control_text(request, limit))?);
         let answer = answer.map_err(|error| Error::of_class(ErrorClass::BadAnswer, error))?;
         put(reply, answer.as_ptr());
@@ -167,8 +169,12 @@ pub extern "C" fn ew_states(
     error: *mut ErrorInfo,
 ) -> i32 {
     guard(error, || {
-        let (server, worlds) = (of(server)?, world..world.saturating_add(1));
-        let truths = server.core.with(|backend| backend.truths(worlds))?;
+        let server = of(server)?;
+        let n_worlds = server.core.info.n_worlds;
+        if world >= n_worlds {
+            return Err(invalid("world", format!("0 to {}", n_worlds - 1), world));
+        }
+        let truths = server.core.with(|it| it.truths(world..world + 1))?;
         let found: Vec<u8> = truths.into_iter().flat_map(|(_, grid)| grid).collect();
         put(states, found.as_ptr());
         server.keep(found);

@@ -28,7 +28,6 @@ pub fn keep<V, O>(kept: &mut Option<View<V, O>>, new: View<V, O>, to: *mut *cons
     put(to, kept.insert(new).pointer());
 }
 
-/// Texts for C, and lists of them.
 #[derive(Default)]
 pub struct Texts {
     texts: Vec<CString>,
@@ -39,7 +38,6 @@ pub struct Texts {
 unsafe impl Send for Texts {}
 
 impl Texts {
-    /// Keeps a text, without bytes that are 0, and returns its pointer.
     pub fn add(&mut self, text: &str) -> *const c_char {
         let text = CString::new(text.replace('\0', "")).unwrap_or_default();
         let pointer = text.as_ptr();
@@ -47,7 +45,6 @@ impl Texts {
         pointer
     }
 
-    /// Keeps texts, and returns a pointer to an array of their pointers.
     pub fn add_all(&mut self, texts: &[String]) -> *const *const c_char {
         let list: Vec<_> = texts.iter().map(|text| self.add(text)).collect();
         let pointer = list.as_ptr();

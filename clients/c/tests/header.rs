@@ -34,7 +34,12 @@ fn generated(folder: &Path) -> String {
         .split_once("  // The server refused")
         .expect("the class");
     let (_, enums) = rest.split_once(",\n").expect("its end");
-    without_links(&format!("{before}{enums}{after}"))
+    let text = format!("{before}{enums}{after}");
+    // The list of all moves is no value in C either.
+    let kept = text
+        .split("\n\n")
+        .filter(|part| !part.contains("ew_move_ALL"));
+    without_links(&kept.collect::<Vec<_>>().join("\n\n"))
 }
 
 /// Replaces links of rustdoc in the comments of messages by names.

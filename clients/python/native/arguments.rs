@@ -37,14 +37,16 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyRes
     Ok(moves.expect("invariant: as_moves returns valid moves"))
 }
 
-/// Returns the worlds of a reset with their seeds. `seeds` has one for each world; `None`: the server's choice.
+/// Returns the worlds of a reset, at most `n_worlds`, with their seeds. `seeds` has one for each world; `None`: the
+/// server's choice.
 pub fn seeds(
     py: Python<'_>,
     seeds: Option<&Bound<'_, PyAny>>,
     worlds: &Bound<'_, PyAny>,
+    n_worlds: u32,
 ) -> PyResult<Vec<WorldSeed>> {
     let pairs: Vec<(Number, Option<u64>)> = arguments(py)?
-        .call_method1("as_seeds", (seeds, worlds))?
+        .call_method1("as_seeds", (seeds, worlds, n_worlds))?
         .extract()?;
     let pairs = pairs.into_iter();
     Ok(pairs
@@ -82,9 +84,13 @@ pub fn absolute_path(path: &Bound<'_, PyAny>) -> PyResult<String> {
     paths.call_method1("utf8", ("path", absolute))?.extract()
 }
 
-/// Converts a timeout. Negative numbers and NaN become 0.
-pub fn duration(seconds: f64) -> Duration {
-    Duration::try_from_secs_f64(seconds.clamp(0.0, 1e9)).unwrap_or_default()
+/// Converts a timeout; refuses NaN and negative numbers.
+pub fn duration(py: Python<'_>, seconds: f64) -> PyResult<Duration> {
+    if !seconds.is_nan() && seconds >= 0.0 {
+        return Ok(Duration::try_from_secs_f64(seconds.min(1e9)).unwrap_or_default());
+    }
+    let expected = "seconds of at least 0";
+    Err(invalid(py, "timeout", expected, seconds))
 }
 
 /// Calls a check of `emberwatch/common/arguments.py`.

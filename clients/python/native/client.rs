@@ -38,7 +38,7 @@ const NAME: &str = concat!("emberwatch-python ", env!("CARGO_PKG_VERSION"));
 /// Attributes:
 ///     info: A `ServerInfo`, the server's description of itself and its worlds.
 ///     instance: The server's instance name; "(embedded)" for worlds in this process.
-#[pyclass(frozen, module = "emberwatch")]
+#[pyclass(frozen, subclass, weakref, dict, module = "emberwatch")]
 pub struct Client {
     pub worlds: Owned<Box<dyn Backend + Send>>,
     pub server: ServerInfo,
@@ -69,7 +69,7 @@ pub struct Client {
 pub fn connect(py: Python<'_>, instance: &str, timeout: f64, wait: f64) -> PyResult<Client> {
     let name = checked(py, instance)?;
     let mut warned = Ok(());
-    let limits = (duration(wait), duration(timeout));
+    let limits = (duration(py, wait)?, duration(py, timeout)?);
     let opened = py.detach(|| {
         let mut has_warned = false;
         Connection::open_within(&name, NAME, limits, |error| {
@@ -131,14 +131,15 @@ impl Client {
         ttl: Option<f64>,
         timeout: f64,
     ) -> PyResult<Lease> {
+        let py = slf.py();
         let claim = Claim {
             robots: robots(first_robot, n_robots),
             takeover,
-            time_to_live: ttl.map(duration),
+            time_to_live: ttl.map(|ttl| duration(py, ttl)).transpose()?,
         };
-        let limit = duration(timeout);
+        let limit = duration(py, timeout)?;
         let acquire = |backend: &mut dyn Backend| lease::Lease::acquire(backend, &claim, limit);
-        let (lease, given) = slf.get().ask(slf.py(), "'acquire'", timeout, acquire)?;
+        let (lease, given) = slf.get().ask(py, "'acquire'", timeout, acquire)?;
         Lease::of(&slf, lease, &given, claim.robots)
     }
 
@@ -239,7 +240,7 @@ impl Client {
         robot: Number,
         timeout: f64,
     ) -> PyResult<Option<Bound<'py, PyAny>>> {
-        let limit = duration(timeout);
+        let limit = duration(py, timeout)?;
         let load = |backend: &mut dyn Backend| left_belief::load(backend, robot.0, None, limit);
         let left = self.ask(py, "'belief'", timeout, load)?;
         left.map(|left| records::left_belief(py, &left)).transpose()
@@ -271,7 +272,7 @@ impl Client {
     ) -> PyResult<Bound<'py, PyAny>> {
         let json = py.import("json")?;
         let text: String = json.call_method1("dumps", (request,))?.extract()?;
-        let limit = duration(timeout);
+        let limit = duration(py, timeout)?;
         let answer = self.ask(py, "a control request", timeout, |backend| {
             backend.control_text(text.as_bytes(), limit)
         })?;
@@ -311,8 +312,8 @@ impl Client {
     /// Raises:
     ///     InvalidArgumentError: If the bytes are damaged or of other worlds, or the worlds are on
     ///         a server. No world has changed then.
-    fn restore_state(&self, py: Python<'_>, worlds: &[u8]) -> PyResult<()> {
-        let restore = |backend: &mut dyn Backend| backend.restore_state(worlds);
+    fn restore_state(&self, py: Python<'_>, worlds: Cow<'_, [u8]>) -> PyResult<()> {
+        let restore = |backend: &mut dyn Backend| backend.restore_state(&worlds);
         self.ask(py, "restore_state", 0.0, restore)
     }
 
@@ -368,7 +369,7 @@ impl Client {
         request: &Request,
         seconds: f64,
     ) -> PyResult<Reply> {
-        let limit = duration(seconds);
+        let limit = duration(py, seconds)?;
         self.ask(py, what, seconds, |backend| backend.control(request, limit))
     }
 
@@ -386,7 +387,7 @@ impl Client {
             flags: if team { FLAG_TEAM_FRAMES } else { 0 },
             ..StepRequest::default()
         };
-        let limit = duration(seconds);
+        let limit = duration(py, seconds)?;
         let answer = self
             .worlds
             .with(py, |backend| backend.step(request, body, limit))?;

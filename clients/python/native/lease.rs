@@ -15,6 +15,7 @@ use emberwatch_messages::message::{
 };
 use pyo3::prelude::*;
 use pyo3::types::{PyRange, PyTuple};
+use std::borrow::Cow;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -30,7 +31,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 ///     robots: The numbers of its robots, a range.
 ///     worlds: The worlds of these robots, a range.
 ///     start: The state of these worlds when the lease was granted, a tuple of `WorldInfo`.
-#[pyclass(frozen, module = "emberwatch")]
+#[pyclass(frozen, subclass, weakref, dict, module = "emberwatch")]
 pub struct Lease {
     #[pyo3(get)]
     client: Py<Client>,
@@ -95,7 +96,7 @@ impl Lease {
         let moves = self.moves(paths, &robots)?;
         let flags = if full { FLAG_FULL_COVERAGE } else { 0 } | team_flag(team);
         let request = self.lease.request(Operation::Step, &robots, flags);
-        let mut call = Call::new(request, &moves, duration(timeout));
+        let mut call = Call::new(request, &moves, duration(py, timeout)?);
         let answer = self.send(py, &mut call);
         self.client.get().answered(py, answer, timeout)
     }
@@ -132,7 +133,7 @@ impl Lease {
         let robots = self.part(robots)?;
         let moves = self.moves(paths, &robots)?;
         let request = self.lease.request(Operation::Step, &robots, 0);
-        let call = Call::new(request, &moves, duration(timeout));
+        let call = Call::new(request, &moves, duration(py, timeout)?);
         let send = |call: &mut Call<'_>| self.send(py, call);
         let waits = || {
             let warned = self.warn_of_wait(py, robots.start);
@@ -165,7 +166,7 @@ impl Lease {
         let robots = self.part(robots)?;
         let flags = team_flag(team);
         let request = self.lease.request(Operation::Observe, &robots, flags);
-        let answer = self.send(py, &mut Call::new(request, &[], duration(timeout)));
+        let answer = self.send(py, &mut Call::new(request, &[], duration(py, timeout)?));
         self.client.get().answered(py, answer, timeout)
     }
 
@@ -190,8 +191,9 @@ impl Lease {
         timeout: f64,
     ) -> PyResult<Bound<'py, PyTuple>> {
         let all = self.worlds(py)?.into_any();
-        let seeds = self::seeds(py, seeds, worlds.unwrap_or(&all))?;
-        let limit = duration(timeout);
+        let n_worlds = self.client.get().server.n_worlds;
+        let seeds = self::seeds(py, seeds, worlds.unwrap_or(&all), n_worlds)?;
+        let limit = duration(py, timeout)?;
         self.replace(py, "'reset'", timeout, |backend| {
             self.lease.reset(backend, seeds, limit)
         })
@@ -225,7 +227,7 @@ impl Lease {
             None => all,
         };
         let file = (absolute_path(path)?, first.0);
-        let limit = duration(timeout);
+        let limit = duration(py, timeout)?;
         self.replace(py, "'restore'", timeout, |backend| {
             self.lease.restore(backend, &worlds, file, limit)
         })
@@ -245,7 +247,7 @@ impl Lease {
         target: Number,
         timeout: f64,
     ) -> PyResult<Bound<'py, PyTuple>> {
-        let limit = duration(timeout);
+        let limit = duration(py, timeout)?;
         self.replace(py, "'fork'", timeout, |backend| {
             self.lease.fork(backend, (source.0, target.0), limit)
         })
@@ -265,7 +267,7 @@ impl Lease {
         py: Python<'_>,
         result: &Bound<'_, PyAny>,
         kind: &str,
-        data: &[u8],
+        data: Cow<'_, [u8]>,
         robot: Option<Number>,
         timeout: f64,
     ) -> PyResult<()> {
@@ -276,16 +278,16 @@ impl Lease {
             ..WorldResult::default()
         };
         let robot = robot.map_or(self.robots.start, |it| it.0);
-        let (place, limit) = ((self.lease.number(), robot), duration(timeout));
+        let (place, limit) = ((self.lease.number(), robot), duration(py, timeout)?);
         let leave =
-            |backend: &mut dyn Backend| left_belief::leave(backend, place, &at, kind, data, limit);
+            |backend: &mut dyn Backend| left_belief::leave(backend, place, &at, kind, &data, limit);
         self.client.get().ask(py, "'leave_belief'", timeout, leave)
     }
 
     /// Restarts the lease's expiry time without acting.
     #[pyo3(signature = (*, timeout=600.0))]
     fn renew(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
-        let limit = duration(timeout);
+        let limit = duration(py, timeout)?;
         let renew = |backend: &mut dyn Backend| self.lease.renew(backend, limit);
         self.client.get().ask(py, "'renew'", timeout, renew)
     }
@@ -293,12 +295,14 @@ impl Lease {
     /// Ends the lease, so that other clients may fly its robots. May be called again.
     #[pyo3(signature = (*, timeout=5.0))]
     fn release(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
-        if self.is_over.swap(true, Ordering::Relaxed) {
+        if self.is_over.load(Ordering::Relaxed) {
             return Ok(());
         }
-        let limit = duration(timeout);
+        let limit = duration(py, timeout)?;
         let release = |backend: &mut dyn Backend| self.lease.release(backend, limit);
-        self.client.get().ask(py, "'release'", timeout, release)
+        self.client.get().ask(py, "'release'", timeout, release)?;
+        self.is_over.store(true, Ordering::Relaxed);
+        Ok(())
     }
 
     fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {

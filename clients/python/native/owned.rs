@@ -7,6 +7,7 @@ use pyo3::prelude::*;
 use std::mem::ManuallyDrop;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::ThreadId;
 use std::time::Duration;
 
 /// Interval at which a thread that waits for another thread checks whether a signal has interrupted it.
@@ -23,9 +24,21 @@ pub struct Owned<T: Send> {
 
 enum Slot<T> {
     Free(T),
-    /// A thread is using the value.
-    Taken,
+    /// This thread is using the value.
+    Taken(ThreadId),
     Closed,
+}
+
+/// The reason why a thread could not take the value.
+enum Untaken {
+    /// A signal handler raised an exception during the wait.
+    Interrupted,
+    /// This thread itself is using the value, in a call that a signal handler interrupted.
+    Own,
+}
+
+fn this_thread() -> ThreadId {
+    std::thread::current().id()
 }
 
 /// A guard of a value that a thread is using. Dropping the guard frees the value for other threads.
@@ -56,15 +69,15 @@ impl<T: Send> Owned<T> {
         self.check(py)?;
         let outcome = py.detach(|| {
             let mut taken = self.take()?;
-            Some(taken.value.as_mut().map(act))
+            Ok(taken.value.as_mut().map(act))
         });
         match outcome {
-            Some(Some(outcome)) => Ok(outcome),
-            Some(None) => {
+            Ok(Some(outcome)) => Ok(outcome),
+            Ok(None) => {
                 let text = format!("{} closed", self.subject("is", "are"));
                 Err(error(py, "EmberwatchError", (text, "closed")))
             }
-            None => Err(raise_of_channel(py, ChannelError::Interrupted)),
+            Err(untaken) => Err(self.untaken(py, untaken)),
         }
     }
 
@@ -83,7 +96,7 @@ impl<T: Send> Owned<T> {
             self.check(py)?;
         }
         let taken = match &mut *self.lock() {
-            slot @ Slot::Free(_) => match std::mem::replace(slot, Slot::Taken) {
+            slot @ Slot::Free(_) => match std::mem::replace(slot, Slot::Taken(this_thread())) {
                 Slot::Free(value) => Some(value),
                 _ => None,
             },
@@ -105,10 +118,24 @@ impl<T: Send> Owned<T> {
     /// # Errors
     /// If the wait for other threads was interrupted; the value is still open.
     pub fn close(&self, py: Python<'_>) -> PyResult<()> {
-        if self.pid != pid() || py.detach(|| self.end(interrupted)) {
+        if self.pid != pid() {
             return Ok(());
         }
-        Err(raise_of_channel(py, ChannelError::Interrupted))
+        let ended = py.detach(|| self.end(interrupted));
+        ended.map_err(|untaken| self.untaken(py, untaken))
+    }
+
+    fn untaken(&self, py: Python<'_>, why: Untaken) -> PyErr {
+        match why {
+            Untaken::Interrupted => raise_of_channel(py, ChannelError::Interrupted),
+            Untaken::Own => {
+                let subject = self.subject("is", "are");
+                let text = format!(
+                    "{subject} in use by this thread, in a call that a signal handler has interrupted: act after the call"
+                );
+                error(py, "EmberwatchError", (text, "in_use"))
+            }
+        }
     }
 
     /// Refuses any process except the one that made the value.
@@ -135,29 +162,32 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits until no other thread uses the value, then takes it. Returns `None` if a signal handler raised an
-    /// exception.
-    fn take(&self) -> Option<Taken<'_, T>> {
+    /// Waits until no other thread uses the value, then takes it.
+    fn take(&self) -> Result<Taken<'_, T>, Untaken> {
         let mut slot = self.lock();
         loop {
-            match std::mem::replace(&mut *slot, Slot::Taken) {
+            match std::mem::replace(&mut *slot, Slot::Taken(this_thread())) {
                 Slot::Free(value) => {
-                    return Some(Taken {
+                    return Ok(Taken {
                         owner: self,
                         value: Some(value),
                     });
                 }
                 Slot::Closed => {
                     *slot = Slot::Closed;
-                    return Some(Taken {
+                    return Ok(Taken {
                         owner: self,
                         value: None,
                     });
                 }
-                Slot::Taken => {
+                Slot::Taken(by) => {
+                    *slot = Slot::Taken(by);
+                    if by == this_thread() {
+                        return Err(Untaken::Own);
+                    }
                     self.wait(slot);
                     if interrupted() {
-                        return None;
+                        return Err(Untaken::Interrupted);
                     }
                     slot = self.lock();
                 }
@@ -165,8 +195,8 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits until no thread uses the value, then drops it. Returns `false` if `stops` ended the wait.
-    fn end(&self, stops: fn() -> bool) -> bool {
+    /// Waits until no thread uses the value, then drops it, unless `stops` ends the wait.
+    fn end(&self, stops: fn() -> bool) -> Result<(), Untaken> {
         let mut slot = self.lock();
         loop {
             match std::mem::replace(&mut *slot, Slot::Closed) {
@@ -174,14 +204,17 @@ impl<T: Send> Owned<T> {
                     drop(slot);
                     self.freed.notify_all();
                     drop(value);
-                    return true;
+                    return Ok(());
                 }
-                Slot::Closed => return true,
-                Slot::Taken => {
-                    *slot = Slot::Taken;
+                Slot::Closed => return Ok(()),
+                Slot::Taken(by) => {
+                    *slot = Slot::Taken(by);
+                    if by == this_thread() {
+                        return Err(Untaken::Own);
+                    }
                     self.wait(slot);
                     if stops() {
-                        return false;
+                        return Err(Untaken::Interrupted);
                     }
                     slot = self.lock();
                 }
@@ -217,7 +250,7 @@ impl<T: Send> Drop for Owned<T> {
             // lock.
             let end = || self.end(|| false);
             if Python::try_attach(|py| py.detach(end)).is_none() {
-                end();
+                let _ = end();
             }
         }
     }

@@ -37,7 +37,7 @@ pub fn observe(
 macro_rules! reader {
     ($(#[$doc:meta])* $name:ident, $header:ty, $open:path, $record:path, {$($new:tt)*}) => {
         $(#[$doc])*
-        #[pyclass(frozen, module = "emberwatch")]
+        #[pyclass(frozen, subclass, weakref, dict, module = "emberwatch")]
         pub struct $name {
             #[pyo3(get)]
             instance: String,
@@ -57,7 +57,7 @@ macro_rules! reader {
                 py: Python<'py>,
                 timeout: f64,
             ) -> PyResult<Option<Bound<'py, PyAny>>> {
-                let limit = duration(timeout);
+                let limit = duration(py, timeout)?;
                 let next = |from: &mut Subscriber<$header>| from.next_of(self.world, limit);
                 let read = self.subscriber.with(py, next)?;
                 let read = read.map_err(|error| raise(py, error, "a sample", timeout))?;
@@ -84,6 +84,10 @@ macro_rules! reader {
 
             fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
                 slf
+            }
+
+            fn __repr__(&self) -> String {
+                format!("<{} of instance {:?}>", stringify!($name), self.instance)
             }
 
             #[pyo3(signature = (*_error))]

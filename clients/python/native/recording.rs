@@ -4,6 +4,7 @@ use crate::errors::error;
 use crate::records;
 use crate::refusal::invalid;
 use emberwatch_messages::recording::{Event, Reader, RecordingError};
+use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 use std::fs::File;
 use std::io::BufReader;
@@ -23,7 +24,8 @@ impl Recording {
     fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let name = path.display().to_string();
         // Opening a FIFO would wait for its writer, and no signal would end the wait.
-        if !py.detach(|| std::fs::metadata(&path))?.is_file() {
+        let found = py.detach(|| std::fs::metadata(&path));
+        if !found.map_err(|error| unread(&name, &error))?.is_file() {
             return Err(invalid(py, "recording", "a regular file", name));
         }
         let reader = py.detach(|| Reader::new(BufReader::new(File::open(path)?)));
@@ -61,10 +63,18 @@ impl Recording {
 fn raise(py: Python<'_>, name: &str, problem: RecordingError) -> PyErr {
     let text = format!("{name}: {problem}");
     let code = match problem {
-        RecordingError::Io(error) => return error.into(),
+        RecordingError::Io(error) => return unread(name, &error),
         RecordingError::Cut { .. } => "cut",
         RecordingError::Damaged { .. } => "damaged",
         _ => "recording",
     };
     error(py, "EmberwatchError", (text, code))
+}
+
+/// Creates the exception for a file that the system could not read.
+fn unread(name: &str, error: &std::io::Error) -> PyErr {
+    match error.raw_os_error() {
+        Some(code) => PyOSError::new_err((code, error.to_string(), name.to_owned())),
+        None => PyOSError::new_err(format!("{name}: {error}")),
+    }
 }

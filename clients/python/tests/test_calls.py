@@ -5,7 +5,7 @@ import signal
 import threading
 
 import pytest
-from failures import fails
+from failures import fails, refuses
 from processes import LONG, PATIENCE, asleep, ctrl_c, eventually, script, server
 
 from emberwatch import errors
@@ -37,11 +37,14 @@ def test_every_call_has_a_timeout() -> None:
     assert started.instance in str(raised.value)
     started.wake_up()
     assert client.observe().result().world.step == 0
-    started.stop()  # NaN and negative timeouts have already passed
-    for timeout in (0, -1, float("nan"), -float("inf")):
-        with pytest.raises(errors.RequestTimeoutError):
-            client.observe(timeout=timeout)
+    started.stop()
+    with pytest.raises(errors.RequestTimeoutError):
+        client.observe(timeout=0)
     started.wake_up()
+    for timeout in (-1, float("nan"), -float("inf")):
+        for call in (client.observe, client.status, lease.renew, lease.reset, client.acquire):
+            with refuses("timeout: expected seconds of at least 0"):
+                call(timeout=timeout)
     assert client.observe(timeout=float("inf")).result().world.step == 0
 
 
@@ -68,6 +71,30 @@ def test_a_handled_signal_does_not_end_a_step() -> None:
         thread.join()
         signal.signal(signal.SIGUSR1, before)
     assert len(caught) == 5
+
+
+def test_a_signal_handler_cannot_use_the_object_that_it_interrupted() -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    codes: list[str] = []
+
+    def handle(*_: object) -> None:
+        for call in (client.close, client.status, lease.release):
+            with pytest.raises(errors.EmberwatchError) as raised:
+                call()
+            codes.append(raised.value.code)
+
+    before = signal.signal(signal.SIGUSR1, handle)
+    started.stop()
+    threading.Timer(0.3, os.kill, (US, signal.SIGUSR1)).start()
+    try:
+        with pytest.raises(errors.RequestTimeoutError):
+            lease.step([3] * 6, timeout=1)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+        started.wake_up()
+    assert codes == ["in_use"] * 3
 
 
 def test_closing_twice_is_allowed_and_closed_clients_refuse() -> None:

@@ -108,6 +108,12 @@ impl Lease {
         claim: &Claim,
         timeout: Duration,
     ) -> Result<(Self, LeaseInfo), ConnectionError> {
+        let lives = Duration::from_millis(100)..=Duration::from_secs(86_400);
+        if let Some(got) = claim.time_to_live.filter(|it| !lives.contains(it)) {
+            let problem = format!("expected 0.1 s to one day, got {got:?}");
+            let what = "time to live";
+            return Err(ConnectionError::NotHere { what, problem });
+        }
         let request = Request::Acquire {
             first_robot: claim.robots.start,
             n_robots: claim.robots.len() as u32,

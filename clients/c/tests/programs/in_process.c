@@ -64,12 +64,16 @@ static void flights(void) {
     IS(EW_FAILURE_INVALID, ew_leave_belief(lease, 0, "too early", NULL, 0, 5, &error));
     uint64_t seeds[3] = {1, 2, 3};
     IS(EW_FAILURE_INVALID, ew_reset(lease, seeds, 2, 5, &a, &error));
+    IS(EW_FAILURE_INVALID, ew_reset(lease, seeds, (size_t)-1, 5, &a, &error));
+    IS(EW_FAILURE_INVALID, ew_reset(lease, seeds, 3, -1, &a, &error));
+    IS(EW_FAILURE_INVALID, ew_acquire(server, 0, 6, false, -1, 5, &none, &error));
+    TRUE(!none);
     IS(0, ew_reset(lease, seeds, 3, 60, &a, &error));
     TRUE(a->n_robots == 6 && a->n_worlds == 3 && a->n_frames == 6 && a->height == 6 && a->width == 7);
     TRUE(a->worlds[2].seed == 3 && a->frames[0] == 255 && a->lease != 0);
     IS(EW_FAILURE_INVALID, ew_step(lease, paths, 23, 0, 5, &a, &error));
     paths[5] = 9;
-    IS(EW_STATUS_BAD_MOVE, ew_step(lease, paths, 24, 0, 5, &a, &error));
+    IS(EW_FAILURE_INVALID, ew_step(lease, paths, 24, 0, 5, &a, &error));
     paths[5] = EW_MOVE_DOWN;
     IS(0, ew_step(lease, paths, 24, EW_TEAM_FRAMES, 5, &a, &error));
     TRUE(a->n_frames == 3 && a->worlds[1].step == 1 && a->robots[1].n_moves == 4);
@@ -79,10 +83,12 @@ static void flights(void) {
     IS(0, ew_states(server, 2, &states, &error));
     TRUE(states[0] < 3 && states[41] < 3);
     IS(EW_FAILURE_INVALID, ew_states(server, 3, &states, &error));
+    IS(EW_FAILURE_INVALID, ew_states(server, UINT32_MAX, &states, &error));
     TRUE(ew_step(lease, paths, 24, 0, 5, NULL, NULL) == 0);
     IS(EW_STATUS_EPISODE_OVER, ew_step(lease, paths, 24, 0, 5, &a, &error));
     IS(0, ew_recall(lease, 1, 0, 5, &a, &error));
     TRUE(a->worlds[0].step == 1);
+    IS(0, ew_leave_belief(lease, 5, "of the present step", paths, 1, 5, &error));
     IS(EW_STATUS_NOT_KEPT, ew_recall(lease, 9, 0, 5, &a, &error));
 }
 

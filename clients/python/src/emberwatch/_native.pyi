@@ -130,7 +130,6 @@ class StepAnswer:
 
 def connect(instance: str = "default", *, timeout: float = 5.0, wait: float = 0.0) -> Client: ...
 
-@final
 class Client:
     def __new__(cls, instance: str = "default", *, timeout: float = 5.0) -> Client: ...
     @staticmethod
@@ -184,7 +183,6 @@ class Client:
     def __enter__(self) -> Self: ...
     def __exit__(self, *_error: object) -> None: ...
 
-@final
 class Lease:
     @property
     def client(self) -> Client: ...
@@ -262,7 +260,6 @@ class _Reader(Generic[_Sample]):
     def __enter__(self) -> Self: ...
     def __exit__(self, *_error: object) -> None: ...
 
-@final
 class Observer(_Reader[Frame]):
     def __new__(
         cls,
@@ -272,11 +269,9 @@ class Observer(_Reader[Frame]):
         timeout: float | None = None,
     ) -> Observer: ...
 
-@final
 class TruthReader(_Reader[Truth]):
     def __new__(cls, instance: str = "default") -> TruthReader: ...
 
-@final
 class OutlookReader(_Reader[Outlook]):
     def __new__(cls, instance: str = "default") -> OutlookReader: ...
 

@@ -14,7 +14,8 @@ class EmberwatchError(Exception):
     Attributes:
         code: The cause. If the server refused a request, the name of the status (PROTOCOL.md
             section 5), such as `"busy"`; the refused request changed nothing in the world. Other
-            codes are `"closed"`, `"interrupted"` (an earlier step or reset did not finish: reset or
+            codes are `"closed"`, `"in_use"` (a signal handler used the object whose call it
+            interrupted), `"interrupted"` (an earlier step or reset did not finish: reset or
             resume; the same of a belief's `correct` or `predict`), `"forked"` (channels and worlds
             in this process do not survive `fork`), `"embedded"` (the worlds in this process could
             not be created), `"threads"` (the system cannot start more threads), `"channel"`

@@ -101,7 +101,8 @@ class WildfireVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
         if method_name == "render":  # in mode "human"
-            return list(self.get_images())
+            pictures = self.get_images()
+            return [pictures[index] for index in self._get_indices(indices)]
         if method_name == "action_masks":
             return list(self.get_attr(method_name)[0]()[self._get_indices(indices)])
         expected = "'render' or 'action_masks', as all worlds share one environment"

@@ -159,7 +159,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         continues = getattr(unwrapped, "continues", False)
         if not (continues and self._was_begun and step == self._step):
             self._belief.reset()
-            for past in unwrapped.past_frames() if step > 0 else ():
+            past_frames = getattr(unwrapped, "past_frames", tuple)
+            for past in past_frames() if step > 0 else ():
                 self._belief.correct(past)
                 self._belief.predict()
             self._belief.correct(frame)

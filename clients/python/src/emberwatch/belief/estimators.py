@@ -6,7 +6,7 @@
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -322,11 +322,18 @@ class Belief:
     def _chosen(self, worlds: ArrayLike | slice | None) -> NDArray[np.bool_]:
         """Returns the mask of the chosen worlds."""
         chosen = np.zeros(self._shape[0], np.bool_)
+        n = len(chosen)
+        expected = f"a mask of {n} worlds, indices from 0 to {n - 1}, or a slice"
+        index = slice(None) if worlds is None else worlds
+        if not isinstance(index, slice):
+            index = as_array(index, "worlds", expected)
+            if not index.size and index.dtype != np.bool_:
+                index = index.astype(np.intp)  # NumPy reads [] as float64
+            if index.ndim > 1 or index.shape == () and index.dtype == np.bool_:
+                raise invalid("worlds", expected, repr_of(worlds))
         try:
-            chosen[slice(None) if worlds is None else cast("Any", worlds)] = True
+            chosen[index] = True
         except (IndexError, TypeError, ValueError):
-            n = len(chosen)
-            expected = f"a mask of {n} worlds, indices from 0 to {n - 1}, or a slice"
             raise invalid("worlds", expected, repr_of(worlds)) from None
         return chosen
 

@@ -18,6 +18,7 @@ from emberwatch.benchmark.policies import Actor, Policy
 from emberwatch.benchmark.rows import Row, new_file, write
 from emberwatch.benchmark.tally import Tally
 from emberwatch.client.client import Client
+from emberwatch.client.wire import TRUTH_BUFFER
 from emberwatch.common.arguments import as_count, as_list, as_seed
 from emberwatch.common.paths import with_absolute_paths
 from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
@@ -80,6 +81,9 @@ def evaluate(
     """
     task = None if keywords.get("task") is None else Task.named(keywords["task"])
     steps = (task.max_steps if task else 1500) if steps is None else steps
+    for what, text in {"name": name, "estimator": estimator or "none"}.items():
+        if not text or not str(text).isprintable():
+            raise invalid(what, "a name for the table", repr_of(text))
     if env not in (_MOVES, _PATHS):
         raise invalid("env", f"{_MOVES!r} or {_PATHS!r}", repr_of(env))
     for what, number in {"steps": steps, "batch": batch}.items():
@@ -97,6 +101,8 @@ def evaluate(
         "team": "shared" if n_robots > 1 and OF_TEAM & parts else "alone",
         "steps": steps,
     }
+    if keywords.get("instance") is not None:
+        batch = min(batch, TRUTH_BUFFER)
     rows: list[Row] = []
     begin = time.monotonic()
     with nullcontext() if csv is None else new_file(csv) as file:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import emberwatch._native as _native
 from emberwatch.client.observer import Frame, Truth
 from emberwatch.client.replies import ServerInfo
+from emberwatch.common.arguments import as_count, as_flag
 from emberwatch.errors import EmberwatchError
 
 
@@ -58,6 +59,8 @@ def read(
         RecordingCutWarning: After the last complete record of a file that was cut short.
         RecordingDamagedWarning: After the last complete record before the damage.
     """
+    world = None if world is None else as_count(world, "world", 0, 2**32 - 1)
+    strict = as_flag(strict, "strict")
     try:
         for record in _records(path):
             if world is None or record.sample.world == world:

@@ -4,6 +4,7 @@ import json
 import operator
 from collections.abc import Iterable, Mapping
 from enum import Enum
+from itertools import islice
 from os import PathLike, fspath
 from typing import Any, SupportsIndex, TypeVar, cast
 
@@ -80,23 +81,25 @@ def as_flag(value: object, subject: str) -> bool:
 
 
 def as_seeds(
-    seeds: Iterable[int | None] | None, worlds: Iterable[int]
+    seeds: Iterable[int | None] | None, worlds: Iterable[int], n_worlds: int
 ) -> list[tuple[int, int | None]]:
-    """Checks the seeds of a reset, one for each world; returns worlds and seeds."""
-    chosen = list(worlds)
-    given = [None] * len(chosen) if seeds is None else as_list(seeds, "seeds")
+    """Checks the seeds of a reset, one for each of at most `n_worlds` worlds; returns both."""
+    chosen = as_list(worlds, "worlds", n_worlds)
+    if len(chosen) > n_worlds:
+        raise invalid("worlds", f"at most {n_worlds}", "more")
+    given = [None] * len(chosen) if seeds is None else as_list(seeds, "seeds", n_worlds)
     if len(given) != len(chosen):
-        raise invalid("seeds", len(chosen), len(given))
+        raise invalid("seeds", len(chosen), "more" if len(given) > n_worlds else len(given))
     return [
         (world, None if seed is None else as_seed(seed))
         for world, seed in zip(chosen, given, strict=True)
     ]
 
 
-def as_list(values: Iterable[_Value], subject: str) -> list[_Value]:
-    """Converts an argument with one value for each world to a list."""
+def as_list(values: Iterable[_Value], subject: str, most: int | None = None) -> list[_Value]:
+    """Converts an argument with one value for each world to a list, of at most `most` + 1."""
     try:
-        return list(values)
+        return list(values if most is None else islice(values, most + 1))
     except Exception as error:  # of any type, as in `as_array`
         got = shortened(f"{type(values).__name__}: {error}")
         raise invalid(subject, "one for each world", got) from None

@@ -81,6 +81,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
             if not self.continues:
                 self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
                 self._take(answer)
+            self._numbers = answer.numbers(self._pays)  # learners may write to its arrays
             seen = self._seen()
             self._session.finish()
         return seen

@@ -38,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = _parser()
     flags = parser.parse_args(arguments)
     if flags.step is not None:
+        if (flags.first, flags.last, flags.every) != (0, math.inf, 1):
+            parser.error("--step: expected no --from, --to or --every beside it, got one")
         flags.first = flags.last = flags.step
     if flags.out.suffix != (".gif" if flags.step is None else ".png"):
         parser.error(f"--out: expected a .gif, or with --step a .png, got {flags.out}")
