@@ -47,12 +47,15 @@ pub struct Left {
 }
 
 fn intent_of(core: &Core, n_states: usize, given: &Intent) -> Outcome<WireIntent> {
-    let words = |given: *const c_char| match given.is_null() {
-        true => Ok(String::new()),
-        false => match text("intent", given)? {
-            text if text.len() <= 256 => Ok(text.to_owned()),
-            text => Err(invalid("intent", "texts of at most 256 bytes", text.len())),
-        },
+    let words = |given: *const c_char| {
+        if given.is_null() {
+            return Ok(String::new());
+        }
+        let words = text("intent", given)?;
+        if words.len() > 256 {
+            return Err(invalid("intent", "texts of at most 256 bytes", words.len()));
+        }
+        Ok(words.to_owned())
     };
     if !given.plan_millis.is_finite() || given.plan_millis < 0.0 {
         return Err(invalid("plan_millis", "at least 0", given.plan_millis));

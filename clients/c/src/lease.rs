@@ -172,7 +172,7 @@ impl LeaseHandle {
         }
         let (accepts_late, flags) = (flags & EW_ACCEPT_LATE != 0, flags & !EW_ACCEPT_LATE);
         let request = self.lease.request(Operation::Step, &self.robots, flags);
-        // A long wait is cut into equal parts, after each of which the lease asks whether the worlds have moved.
+        // Splits a long wait into equal parts. After each, the lease asks whether the worlds have moved.
         let n_parts = limit.as_secs_f64().div_euclid(STEP_TIMEOUT.as_secs_f64()) as u32 + 1;
         let paths = Call::new(request, moves, limit / n_parts);
         let send = |call: &mut Call<'_>| self.send(call);

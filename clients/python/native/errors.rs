@@ -103,7 +103,7 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
             detail,
             message,
         } => error(py, "refusal", (status as u32, detail, message)),
-        ConnectionError::NotHere { .. } => error(py, "InvalidArgumentError", (plain(&problem),)),
+        ConnectionError::Invalid { .. } => error(py, "InvalidArgumentError", (plain(&problem),)),
         other => bad_answer(py, &other.to_string()),
     }
 }

@@ -132,6 +132,17 @@ def test_a_lone_robot_is_never_late(env: Any) -> None:
     assert [resume(env), step(env)] == [3, 4]
 
 
+def test_a_resume_shows_nothing_that_a_learner_wrote() -> None:
+    env = make(observation=("frame", "robot")).unwrapped
+    env.reset(seed=1)
+    seen = env.step(PATH)[0]
+    kept = {name: part.copy() for name, part in seen.items()}
+    for part in seen.values():
+        part[...] = 77
+    again, _ = env.reset(options={"resume": True})
+    assert (again["robot"] == kept["robot"]).all() and (again["frame"] == kept["frame"]).all()
+
+
 def test_a_warning_raised_as_an_error_changes_no_state() -> None:
     env = closed_later(gymnasium.make("emberwatch/WildfireSmall-v0").unwrapped)
     env.reset(seed=1000)

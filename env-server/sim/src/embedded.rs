@@ -150,7 +150,7 @@ impl Embedded {
         let worlds = self.simulator.worlds();
         match self.episodes(worlds.clone())? {
             Some(_) => Ok(worlds),
-            None => Err(ConnectionError::NotHere {
+            None => Err(ConnectionError::Invalid {
                 what,
                 problem: "expected worlds after their burn-in, got one during it".into(),
             }),
@@ -312,7 +312,7 @@ impl Backend for Embedded {
                 .into_iter()
                 .map(|it| (world_result(it.outcome()), it.states().to_owned()))
                 .collect()),
-            None => Err(ConnectionError::NotHere {
+            None => Err(ConnectionError::Invalid {
                 what: "truths",
                 problem: format!(
                     "expected embedded worlds with publish_truth that are not in a reset, got worlds {worlds:?}"
@@ -325,17 +325,17 @@ impl Backend for Embedded {
         let what = "clone_state";
         let worlds = self.ready_worlds(what)?;
         let bytes = self.simulator.snapshot(worlds);
-        bytes.map_err(|error| not_here(what, &error))
+        bytes.map_err(|error| invalid(what, &error))
     }
 
     fn restore_state(&mut self, bytes: &[u8]) -> Result<(), ConnectionError> {
         let what = "restore_state";
         let worlds = self.ready_worlds(what)?;
         let restored = decode(bytes).and_then(|it| it.restore(self.simulator.spec()));
-        let restored = restored.map_err(|error| not_here(what, &error))?;
+        let restored = restored.map_err(|error| invalid(what, &error))?;
         if restored.len() != worlds.len() {
             let expected = format!("{} worlds", worlds.len());
-            return Err(not_here(
+            return Err(invalid(
                 what,
                 &SnapshotError::n_worlds(expected, restored.len()),
             ));
@@ -348,8 +348,8 @@ impl Backend for Embedded {
     }
 }
 
-fn not_here(what: &'static str, error: &SnapshotError) -> ConnectionError {
-    ConnectionError::NotHere {
+fn invalid(what: &'static str, error: &SnapshotError) -> ConnectionError {
+    ConnectionError::Invalid {
         what,
         problem: error.to_string(),
     }

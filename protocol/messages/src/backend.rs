@@ -42,7 +42,7 @@ pub trait Backend {
     /// Copies the latest results and the hidden states of consecutive worlds in this process.
     ///
     /// # Errors
-    /// [`ConnectionError::NotHere`] if the worlds are on a server, do not exist, are in a reset, or hide their states.
+    /// [`ConnectionError::Invalid`] if the worlds are on a server, do not exist, are in a reset, or hide their states.
     fn truths(
         &mut self,
         _worlds: Range<u32>,
@@ -53,7 +53,7 @@ pub trait Backend {
     /// Encodes all worlds in this process as the bytes of a snapshot.
     ///
     /// # Errors
-    /// [`ConnectionError::NotHere`] if the worlds are on a server, in a reset, or too large for a snapshot.
+    /// [`ConnectionError::Invalid`] if the worlds are on a server, in a reset, or too large for a snapshot.
     fn clone_state(&mut self) -> Result<Vec<u8>, ConnectionError> {
         Err(on_server("clone_state"))
     }
@@ -62,7 +62,7 @@ pub trait Backend {
     /// as the saved ones would have.
     ///
     /// # Errors
-    /// [`ConnectionError::NotHere`] if the worlds are on a server or in a reset, or the bytes are damaged or of other
+    /// [`ConnectionError::Invalid`] if the worlds are on a server or in a reset, or the bytes are damaged or of other
     /// worlds. No world has changed then.
     fn restore_state(&mut self, _bytes: &[u8]) -> Result<(), ConnectionError> {
         Err(on_server("restore_state"))
@@ -70,7 +70,7 @@ pub trait Backend {
 }
 
 fn on_server(what: &'static str) -> ConnectionError {
-    ConnectionError::NotHere {
+    ConnectionError::Invalid {
         what,
         problem: "expected worlds in this process, got worlds of a server".into(),
     }
@@ -93,5 +93,20 @@ impl<B: Backend> Backend for &mut B {
 
     fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError> {
         (**self).control_text(text, timeout)
+    }
+
+    fn truths(
+        &mut self,
+        worlds: Range<u32>,
+    ) -> Result<Vec<(WorldResult, Grid<u8>)>, ConnectionError> {
+        (**self).truths(worlds)
+    }
+
+    fn clone_state(&mut self) -> Result<Vec<u8>, ConnectionError> {
+        (**self).clone_state()
+    }
+
+    fn restore_state(&mut self, bytes: &[u8]) -> Result<(), ConnectionError> {
+        (**self).restore_state(bytes)
     }
 }

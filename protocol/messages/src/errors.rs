@@ -118,9 +118,9 @@ pub enum ConnectionError {
         detail: u64,
         message: String,
     },
-    /// The request applies only to worlds in this process, or cannot be met by them now. Nothing has changed.
+    /// An argument is out of range, or these worlds cannot meet the request. Nothing was sent or changed.
     #[error("{what}: {problem}")]
-    NotHere { what: &'static str, problem: String },
+    Invalid { what: &'static str, problem: String },
     /// The answer is invalid, because the client and the server are different releases.
     #[error("answer to {what}: {problem}")]
     Garbled { what: &'static str, problem: String },
@@ -163,7 +163,7 @@ impl ConnectionError {
             Self::ServerGone { .. } => ErrorClass::ServerGone,
             Self::Timeout { .. } => ErrorClass::Timeout,
             Self::Refused { .. } => ErrorClass::Refused,
-            Self::NotHere { .. } => ErrorClass::Invalid,
+            Self::Invalid { .. } => ErrorClass::Invalid,
             Self::Garbled { .. } => ErrorClass::BadAnswer,
         }
     }

@@ -112,7 +112,7 @@ impl Lease {
         if let Some(got) = claim.time_to_live.filter(|it| !lives.contains(it)) {
             let problem = format!("expected 0.1 s to one day, got {got:?}");
             let what = "time to live";
-            return Err(ConnectionError::NotHere { what, problem });
+            return Err(ConnectionError::Invalid { what, problem });
         }
         let request = Request::Acquire {
             first_robot: claim.robots.start,
@@ -224,6 +224,8 @@ impl Lease {
         }
     }
 
+    /// Makes the lease with a number that the server has given, on these robots. Their worlds are at step 0 until
+    /// [`Self::note`] tells another.
     pub fn new(info: &ServerInfo, number: u64, robots: &Range<u32>) -> Self {
         let worlds = worlds_of(robots.start, robots.len() as u32, info.n_robots);
         Self {

@@ -70,11 +70,6 @@ def invalid(subject: object, expected: object, got: object) -> InvalidArgumentEr
     return InvalidArgumentError(f"{subject}: expected {expected}, got {got}")
 
 
-def bad_answer(subject: object, expected: object, got: object) -> EmberwatchError:
-    """Returns the error for a malformed answer or published sample."""
-    return EmberwatchError(f"{subject}: expected {expected}, got {got}", "bad_answer")
-
-
 class LeaseLostError(EmberwatchError):
     """The lease ended, or another client took over some of its robots.
 

@@ -81,7 +81,8 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
             if not self.continues:
                 self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
                 self._take(answer)
-            self._numbers = answer.numbers(self._pays)  # learners may write to its arrays
+            else:  # learners may have written to the arrays
+                self._numbers = answer.numbers(self._pays)
             seen = self._seen()
             self._session.finish()
         return seen
