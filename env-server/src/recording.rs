@@ -26,7 +26,6 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Maximum wait for a frame before the recorder checks whether to stop.
 const TICK: Duration = Duration::from_millis(50);
 
 /// Time between flushes, so that every record reaches the operating system within a second.
@@ -60,7 +59,6 @@ pub struct RecordOptions {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RecordSummary {
     pub totals: Totals,
-    /// Number of recorded world steps.
     pub n_steps: u64,
     pub n_bytes: u64,
     /// Number of samples that were not recorded, because their server did not answer `hello`.
@@ -233,7 +231,6 @@ impl Recorder<'_> {
         None
     }
 
-    /// Warns if the server lacks requested worlds or does not publish requested hidden states.
     fn warn_of_gaps(&self, info: &ServerInfo) {
         if self.options.truth && !info.publish_truth {
             tracing::warn!(
@@ -273,7 +270,6 @@ impl Recorder<'_> {
         });
     }
 
-    /// Returns whether more steps are to be recorded and the writing thread still runs.
     fn wants_more(&self) -> bool {
         let is_done = self.options.n_steps > 0 && self.n_steps >= self.options.n_steps;
         !is_done && self.writing.is_running()
@@ -296,7 +292,6 @@ impl Channel {
         self.next.is_some_and(|next| sequence < next)
     }
 
-    /// Counts a sample. Returns the number of samples lost since the last recorded one.
     fn count(&mut self, sequence: u64, is_recorded: bool) -> u32 {
         let expected = self.next.unwrap_or(sequence);
         self.n_lost = self

@@ -36,7 +36,6 @@ pub use wire::{
     turn, wait,
 };
 
-/// A client of a server.
 pub type Client = client::Client<Connection>;
 
 #[cfg(doctest)]

@@ -17,7 +17,6 @@ use tracing_subscriber::prelude::*;
 /// Maximum number of bytes that wait to be written. Further lines are dropped.
 const MAX_WAITING: usize = 1 << 20;
 
-/// Maximum time for which an ending program waits until its log is written.
 const PATIENCE: Duration = Duration::from_secs(1);
 
 const DEFAULT: &str = "info";

@@ -3,10 +3,8 @@
 
 use std::time::{Duration, Instant};
 
-/// Minimum time between two warnings of one kind.
 const INTERVAL: Duration = Duration::from_secs(10);
 
-/// Decides which warnings of one kind are logged.
 #[derive(Debug, Default)]
 pub struct Throttle {
     last: Option<Instant>,

@@ -19,7 +19,6 @@ struct Tagged<T> {
 #[derive(Clone, Copy)]
 struct Tag {
     kind: TypeId,
-    /// The process that made the handle.
     pid: u32,
     free: fn(*mut c_void, bool),
 }

@@ -70,7 +70,6 @@ pub struct Answer {
     pub simulation_nanos: u64,
 }
 
-/// An answer of the server, and the number of steps before it that were missed.
 type Seen = (StepAnswer, u64);
 
 type AnswerView = View<Answer, (Vec<WorldResult>, Vec<RobotResult>, Vec<u8>)>;
@@ -94,7 +93,6 @@ impl LeaseHandle {
         Ok((world, *result.ok_or_else(missing)?))
     }
 
-    /// Makes the view of an answer, and of the number of steps before it that were missed.
     fn view(&self, ((reply, payload), n_skipped): Seen) -> Outcome<AnswerView> {
         let parts = split_step_payload(&reply, &payload)
             .map_err(|expected| garbled("step", format!("expected {expected} bytes")))?;

@@ -106,7 +106,6 @@ impl Samples {
 struct Reading {
     source: Source,
     last: Option<View<Sample, Memory>>,
-    /// Why a recording cannot be read further.
     end: Option<String>,
 }
 
@@ -117,7 +116,6 @@ enum Source {
     Recording(Box<Reader<BufReader<File>>>),
 }
 
-/// The memory to which a sample points.
 type Memory = Box<dyn Send>;
 
 fn bad(problem: impl Display) -> Error {

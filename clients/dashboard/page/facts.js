@@ -44,7 +44,6 @@ export function createFacts() {
       drawEmpty(picture);
     },
     recovered() { isTroubled = false; },
-    /** Shows that the dashboard is gone, or refuses this browser. The last picture stays visible. */
     gone(reason) {
       if (reason) drawTrouble("full", `The dashboard refuses this browser: ${reason}. Trying again every second.`, reason);
       else drawTrouble("gone", "The dashboard is gone; reconnecting every second.", "dashboard gone, reconnecting");

@@ -17,7 +17,6 @@ const THIN = { light: 2, dark: 1 };
 // The layer is kept, because it is the same for all panels and rarely changes.
 let kept = { key: "", layer: null };
 
-/** Draws the no-fly hatches on a panel's marks. */
 export function drawLand(frame, picture) {
   const { arrays: { no_fly: noFly }, info } = picture;
   if (!noFly) return;
@@ -27,7 +26,6 @@ export function drawLand(frame, picture) {
   frame.context.drawImage(kept.layer, 0, 0);
 }
 
-/** Draws the line around the observed cells, if robots see beyond their paths. */
 export function drawFootprint(frame, picture) {
   const { arrays, info } = picture;
   if (!info.radius || frame.cell.x < MIN_LINE_CELL * frame.ratio) return;

@@ -71,7 +71,6 @@ function range(from, to) {
   return Array.from({ length: to - from + 1 }, (_, i) => from + i);
 }
 
-/** Keeps `panels` fitted to `stage`. */
 export function createLayout({ stage, field, panels }, places) {
   let sizes = "";
 
@@ -105,7 +104,6 @@ export function createLayout({ stage, field, panels }, places) {
     apply(best, gap, isStacked ? share : Math.max(best.width, CAPTION_WIDTH * rem));
   }
 
-  // Returns the height of everything except the panels.
   function usedByOthers() {
     const rowGap = parseFloat(getComputedStyle(field).rowGap);
     const others = [...field.children].filter((child) => child !== panels && child.offsetHeight > 1);

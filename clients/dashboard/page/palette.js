@@ -32,7 +32,6 @@ const RAMPS = {
 // Colours of a team's paths and robots. All are light, so that dark edges and numbers are visible on them.
 const ROBOTS = ["#5ee6c8", "#ff9ad5", "#b9f04a", "#8fd0ff", "#ffa64d", "#c9a8ff", "#f5f09a", "#d9c2a0"];
 
-// The objective before an agent has planned its first path.
 const IDLE = { name: "nothing yet", color: "#8b93a0" };
 
 // Colours beyond these lists are generated. Hues are this many degrees apart (the golden angle), so that neighbours
@@ -44,7 +43,6 @@ const SATURATION = 0.55;
 // Colours of objectives that name no state; they differ from the wildfire's colours.
 const OBJECTIVES = ["#8a63b8", "#009e73", "#cc79a7", "#56b4e9", "#8c510a"];
 
-/** The byte that means "not observed" in grids. */
 export const NEVER = 255;
 
 // Old observations fade: each keeps OLDEST_SHARE of its colour, and the rest of its colour halves every HALF_AGE steps.
@@ -139,7 +137,6 @@ function distance(one, other) {
   return a.reduce((sum, channel, i) => sum + (channel - b[i]) ** 2, 0);
 }
 
-// Returns the colour of an observation made `age` steps ago.
 function faded(color, unseen, age) {
   return blend(unseen, color, OLDEST_SHARE + (1 - OLDEST_SHARE) * 2 ** (-age / HALF_AGE));
 }

@@ -20,7 +20,6 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
   const hold = (cell) => { keyed = cell; byKey(cell); };
   const release = () => { keyed = null; };
 
-  /** Rebuilds the panels if their number, names or shape have changed. Returns whether it rebuilt them. */
   function build(picture) {
     const beliefs = namesOf(picture);
     const maps = mapsOf(picture);
@@ -58,7 +57,6 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
       isBare: built.beliefs.length === 0,
       regular: Math.max(built.beliefs.length + 1, OBSERVED.length + 1),
     }),
-    /** Returns the cell selected by keys or the pointer, { row, col }; null if none is. */
     cell(picture) {
       const pointed = keyed ? null : pointer.on(built.panels.map((panel) => panel.grid));
       return pointed ? cellAt(pointed, shapeOf(picture)) : keyed;

@@ -60,7 +60,6 @@ export function drawLine(frame, values, { axis, left, hover, looked }) {
   for (const serial of [looked, hover]) drawCursor(plot, axis, serial, values, y);
 }
 
-/** Draws the strip of objectives, with the axis of steps below. */
 export function drawStrip(frame, values, { axis, left, hover, looked }, colors) {
   if (!frame) return;
   const plot = { ...frame, left };

@@ -6,7 +6,6 @@ import { isTeam, short } from "./words.js";
 
 const DID = { flew: "flew", hovered: "hovered", late: "late", new: "not flown yet" };
 
-/** Maintains the list `root`. Hides the list for a single robot, because the facts describe it. */
 export function createRobots(root) {
   let rows = [];
 

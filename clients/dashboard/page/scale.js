@@ -10,7 +10,6 @@ export function ticks(low, high, count) {
   return { at, step };
 }
 
-/** Returns a tick's label, with as many digits as the step between ticks needs. */
 export function tickText(value, step) {
   if (Math.abs(value) >= 10000 && step >= 1000) return `${Math.round(value / 100) / 10}k`;
   return value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));

@@ -18,7 +18,6 @@ export function short(value) {
   return value.toFixed(size >= 10 ? 1 : size >= 1 ? 2 : 3);
 }
 
-/** Formats the range of a map's factors: 0.412 to 2.03. */
 export function rangeOf([least, most]) {
   return `${short(least)} to ${short(most)}`;
 }

@@ -147,7 +147,6 @@ impl Album {
         true
     }
 
-    /// Forgets the oldest steps of the worlds with the most steps, until the kept steps fit in memory.
     fn make_room(&mut self) {
         while self.n_bytes > MAX_BYTES {
             let worlds = self.worlds.values_mut();

@@ -58,7 +58,6 @@ pub struct States {
     pub target: usize,
 }
 
-/// The identity of a step: seed, episode and step number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Key {
     pub(crate) seed: u64,
@@ -143,7 +142,6 @@ impl Robot {
 }
 
 impl Belief {
-    /// Converts a published belief. Scores the belief if its states are the model's `states` and `truth` is known.
     pub(crate) fn of(
         published: &AgentBelief,
         truth: Option<&[u8]>,

@@ -194,7 +194,6 @@ fn newest(strip: &Strip) -> Option<(u64, &Entry)> {
     Some(believed.map_or(newest, |(back, entry)| (last - back, entry)))
 }
 
-/// Returns the length and the padded JSON.
 fn framed(header: &Header<'_>) -> Vec<u8> {
     let mut text = serde_json::to_vec(header).expect("invariant: a header serialises");
     text.resize((text.len() + 4).next_multiple_of(8) - 4, b' ');
@@ -313,7 +312,6 @@ fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     number as u8
 }
 
-/// Returns the server's airspace. If that is unknown or belongs to another grid, returns one without no-fly cells.
 fn airspace(info: Option<&Info>, entry: &Entry) -> Airspace {
     let known = info.and_then(|info| info.airspace.clone());
     let known = known.filter(|airspace| airspace.shape() == entry.shape);

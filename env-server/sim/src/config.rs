@@ -120,7 +120,6 @@ impl Checked {
         Ok(self)
     }
 
-    /// Describes the model in a line.
     pub fn about_model(&self) -> String {
         let (model, file) = (&self.model, self.model.file());
         let rule = if file.transitions.is_empty() {
@@ -390,7 +389,6 @@ mod tests {
 {"height": 16.0} => height: expected 1 to 4096, got 16.0
 {"height": "x"} => height: expected 1 to 4096, got x
 {"width": 4097} => width: expected 1 to 4096, got 4097
-{"moves": null} => moves: expected 1 to 4096, got null
 {"seed": -1} => seed: expected 0 to 18446744073709551615, got -1
 {"worlds": 4294967296} => worlds: expected 1 to 1024, got 4294967296
 {"reveal_model": 1} => reveal_model: expected true or false, got 1

@@ -38,7 +38,6 @@ use thiserror::Error;
 /// Maximum number of queued file jobs. Each job keeps a whole snapshot in memory.
 const MAX_FILES: usize = 16;
 
-/// The index of a world and its episode after a reset.
 type Reset = (usize, Box<Episode>);
 
 /// A simulator inside this process, with the threads for its slow work.
@@ -59,19 +58,15 @@ pub struct Embedded {
     is_over: bool,
 }
 
-/// The reason why worlds could not be opened.
 #[derive(Debug, Error)]
 pub enum OpenError {
-    /// The settings could not be read.
     #[error(transparent)]
     Settings(#[from] ReadError),
-    /// The worlds could not be created.
     #[error("{0:#}")]
     Worlds(anyhow::Error),
 }
 
 impl OpenError {
-    /// Returns the class of the error.
     pub fn class(&self) -> ErrorClass {
         match self {
             Self::Settings(ReadError::Wait(error)) => error.class(),
@@ -86,17 +81,11 @@ impl OpenError {
 
 impl Embedded {
     /// Reads and checks settings as [`settings::read`] does, and creates the worlds.
-    ///
-    /// # Errors
-    /// As for [`settings::read`] and [`Self::new`].
     pub fn open(given: Map<String, Value>) -> Result<Self, OpenError> {
         Self::new(settings::read(given)?).map_err(OpenError::Worlds)
     }
 
     /// Creates the worlds and starts their burn-ins. Ignores settings about channels and automatic snapshots.
-    ///
-    /// # Errors
-    /// If the model does not fit the grid, there is too little memory, or no threads can be started.
     pub fn new(checked: Checked) -> Result<Self> {
         let config = &checked.config;
         let n_threads = n_threads(config).min(config.worlds as usize);
@@ -131,9 +120,6 @@ impl Embedded {
     }
 
     /// Returns the current episodes of consecutive worlds, or `None` if a world does not exist or is being reset.
-    ///
-    /// # Errors
-    /// If the worlds were shut down.
     pub fn episodes(
         &mut self,
         mut worlds: Range<usize>,
@@ -205,7 +191,6 @@ impl Embedded {
         }
     }
 
-    /// Runs a file job on its thread and waits for the result.
     fn file(
         &mut self,
         job: Job,
@@ -356,7 +341,6 @@ fn invalid(what: &'static str, error: &SnapshotError) -> ConnectionError {
 }
 
 impl Drop for Embedded {
-    /// Stops burn-ins that are still running.
     fn drop(&mut self) {
         self.rules.ended.store(true, Ordering::Relaxed);
     }

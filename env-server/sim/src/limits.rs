@@ -28,9 +28,6 @@ pub fn start(pool: ThreadPoolBuilder, n_threads: usize) -> Result<ThreadPool, No
 
 /// Checks that there is memory for all worlds, for the `n_threads` worlds that may be reset at the same time, and for
 /// the longest answer. Call this function after the threads have started.
-///
-/// # Errors
-/// If there is too little memory.
 pub fn check_memory(checked: &Checked, n_threads: usize) -> Result<(), NoMemory> {
     let n_worlds = checked.config.worlds as usize;
     let n_at_once = (n_worlds + n_threads.min(n_worlds)) as u64;
@@ -48,8 +45,6 @@ pub fn answer_bytes(checked: &Checked) -> usize {
     config.worlds as usize * (WORLD_BYTES + config.world.robots as usize * (ROBOT_BYTES + n_cells))
 }
 
-/// Returns an upper bound on the memory of a world, in bytes: its current states, its states at k = 0, its robots and
-/// its history.
 fn bytes_of_world(checked: &Checked) -> usize {
     let (config, n_cells) = (&checked.config, checked.shape.n_cells());
     let sensor = checked.model.file().sensor.as_ref();

@@ -2,10 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-/// Minimum length of the time window over which the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
 
-/// A measurement of world steps per second over the last window.
 pub struct Rate {
     since: Instant,
     n_steps: u64,

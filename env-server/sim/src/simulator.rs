@@ -3,21 +3,15 @@
 mod advance;
 mod answer;
 mod barrier;
-#[cfg(test)]
-mod barrier_tests;
 mod beliefs;
 mod control;
 mod lease;
-#[cfg(test)]
-mod lease_tests;
 mod outcome;
 mod share;
 mod state;
 mod step;
 #[cfg(test)]
-mod test_worlds;
-#[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod worlds;
 
 pub use barrier::Ticket;

@@ -90,7 +90,7 @@ impl StatesFile {
 }
 
 impl Sequences {
-    /// Creates an empty collection. Values of added arrays must be below `n_states`.
+    /// Values of added arrays must be below `n_states`.
     pub fn new(n_states: usize) -> Self {
         Self {
             n_states,

@@ -5,10 +5,12 @@ use emberwatch_model::built_in::state_names;
 use emberwatch_model::grid::MAX_SIDE;
 use emberwatch_model::settings::{ANY, Settings};
 use emberwatch_model::task::Task;
-use emberwatch_model::{MAX_VALUES, Model};
+use emberwatch_model::text::MAX_TEXT_BYTES;
+use emberwatch_model::{MAX_KERNEL_SIDE, MAX_RADIUS, MAX_VALUES, Model};
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::states_file::MAX_BYTES;
 use std::collections::BTreeSet;
+use std::path::Path;
 
 const ENVIRONMENTS: &str = include_str!("../../../docs/environments/index.md");
 
@@ -99,27 +101,29 @@ fn every_setting_is_explained_with_its_range() {
 
 #[test]
 fn the_limits_are_those_of_the_code() {
-    let python = include_str!("../../../clients/python/README.md");
-    let machines = include_str!("../../../docs/many-machines.md");
-    let landscapes = include_str!("../../../docs/landscapes.md");
-    let (side, gibibytes) = (format!("{MAX_SIDE} x {MAX_SIDE} cells"), MAX_BYTES >> 30);
-    let clients = format!("takes {MAX_CLIENTS} clients at a time");
-    for (page, words) in [
-        (
-            RECORDED,
-            format!("Grids have up to {side}, all sequences together up to {gibibytes} GiB"),
-        ),
-        (RECORDED, format!("at most {MAX_VALUES}.")),
-        (landscapes, format!("more than {side}, as the server takes")),
-        (python, format!("may have up to {MAX_ROBOTS} robots")),
-        (python, clients.clone()),
-        (
-            machines,
-            format!("{clients}, and {MAX_ROBOT_NUMBERS} robots"),
-        ),
-    ] {
-        let page: Vec<&str> = page.split_whitespace().collect();
-        let page = page.join(" ").replace("4,096", "4096");
-        assert!(page.contains(&words), "{words:?} is on no page");
+    let (mebibytes, gibibytes) = (MAX_TEXT_BYTES >> 20, MAX_BYTES >> 30);
+    let limits = format!(
+        "docs/model-file.md => 2 to {MAX_VALUES},
+        docs/model-file.md => 1 to {MAX_VALUES},
+        docs/model-file.md => each odd, 1 to {MAX_KERNEL_SIDE} |
+        docs/model-file.md => an odd number of rows and of columns up to {MAX_KERNEL_SIDE}
+        docs/model-file.md => | `radius` | integer | 0 to {MAX_RADIUS} |
+        docs/model-file.md => at most {mebibytes} MiB. Grids have up to {MAX_SIDE} x {MAX_SIDE} cells
+        README.md => names 2 to {MAX_VALUES} states
+        README.md => up to {MAX_KERNEL_SIDE} x {MAX_KERNEL_SIDE} cells
+        docs/recorded-worlds.md => Grids have up to {MAX_SIDE} x {MAX_SIDE} cells, all sequences together up to {gibibytes} GiB
+        docs/recorded-worlds.md => at most {MAX_VALUES}.
+        docs/landscapes.md => more than {MAX_SIDE} x {MAX_SIDE} cells, as the server takes
+        clients/python/README.md => may have up to {MAX_ROBOTS} robots
+        clients/python/README.md => takes {MAX_CLIENTS} clients at a time
+        docs/many-machines.md => takes {MAX_CLIENTS} clients at a time, and {MAX_ROBOT_NUMBERS} robots"
+    );
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    for line in limits.lines() {
+        let (page, words) = line.trim().split_once(" => ").expect(line);
+        let text = std::fs::read_to_string(root.join(page)).expect(page);
+        let text: Vec<&str> = text.split_whitespace().collect();
+        let text = text.join(" ").replace("4,096", "4096");
+        assert!(text.contains(words), "{words:?} is not in {page}");
     }
 }

@@ -1,11 +1,11 @@
 //! Tests of states files: files in the form in which NumPy writes them, and the error for each kind of broken file.
 
 use emberwatch_model::built_in::state_names;
-use emberwatch_model::settings::WorldSettings;
 use emberwatch_sim::config::ServerConfig;
 use emberwatch_sim::states_file::{Sequences, StatesFile};
 use ndarray::{Array, Array3, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
+use serde_json::{Value, json};
 use std::fs::{create_dir, write};
 use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
@@ -30,10 +30,8 @@ const HEADER: &str = "{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4
 /// Rows of three fields: a part of [`HEADER`] => its replacement => a part of the expected error.
 const WRONG_HEADERS: &str = "
 |u1 => <f4 => expected dtype '|u1' (uint8), got '<f4'
-|u1 => |i1 => expected dtype '|u1' (uint8), got '|i1'
 |u1 => |b1 => expected dtype '|u1' (uint8), got '|b1'
 (2, 3, 4) => (2, 3, 4, 1) => expected three axes [K, H, W], got 4
-(2, 3, 4) => (24,) => expected three axes [K, H, W], got 1
 (2, 3, 4) => (0, 3, 4) => expected the end after the array, got 24 more bytes
 (2, 3, 4) => (1, 4, 6) => expected at least 2 recorded steps, got 1
 (2, 3, 4) => (2, 3, 5) => cut short: expected 6 more bytes
@@ -152,10 +150,6 @@ fn broken_arrays_are_refused_each_by_its_problem() {
         let expected = format!("array \"lab\": {words}");
         assert!(error.starts_with("states file /"), "{error}");
         assert!(error.contains(&expected), "{error:?}: {expected:?}");
-        let archive = stored(&[("one.npy", bytes.to_vec())]);
-        let error = read("lab.npz", &archive).expect_err(words);
-        let expected = format!("array \"one\": {words}");
-        assert!(error.contains(&expected), "{error:?}: {expected:?}");
     };
     // The header is checked before the values are read.
     let breaks_off = |header: &str, n_values: u64| {
@@ -191,7 +185,6 @@ fn broken_arrays_are_refused_each_by_its_problem() {
         npy(&fourth) => "expected states below 3, as in the description, got 3 in cell (2, 3) of recorded step 1";
         npy_with(&header("False", &"[".repeat(60_000))) => "expected a NumPy array with a header of at most 512 bytes, got 60058";
         b"".to_vec() => "expected a NumPy array: ";
-        b"PNG and so on".to_vec() => "expected a NumPy array: ";
     } {
         check(&bytes, words);
     }
@@ -232,7 +225,6 @@ fn broken_archives_are_refused_each_by_its_problem() {
     let turned = npy(&sequence(0, (2, 4, 3)));
     for (bytes, words) in rows! {
         whole.clone() => "expected a .npz (zip) archive, got another or a damaged file (";
-        Vec::new() => "expected a .npz (zip) archive, got another or a damaged file (";
         deflated[..deflated.len() / 2].to_vec() => "expected a .npz (zip) archive, got another or a damaged file (";
         stored(&[]) => "expected at least one array, got none";
         two("a.txt", &whole) => "expected only .npy members, got \"a.txt\"";
@@ -287,36 +279,24 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
         ("b.npy", npy(&sequence(0, (9, 3, 4)))),
     ];
     let path = file_in(&folder, "lab.npz", &stored(&members));
-    let config = |states_offset| ServerConfig {
-        world: WorldSettings {
-            states: path.display().to_string(),
-            states_offset,
-            ..WorldSettings::default()
-        },
-        ..ServerConfig::default()
+    let check = |given: Value| {
+        let config = ServerConfig::default().with(given.as_object().expect("a dictionary"));
+        config.expect("settings").check()
     };
-    let checked = config(3).check().expect("valid");
+    let config = |offset: u32| json!({"states": path, "states_offset": offset});
+    let checked = check(config(3)).expect("valid");
     let settings = &checked.config.world;
     let decided = (settings.height, settings.width, settings.burn_in);
     assert_eq!((decided, &*settings.model), ((3, 4, 0), ""));
     let recorded = checked.recorded.expect("it is").recorded;
     assert_eq!((recorded.n_sequences(), recorded.n_steps()), (2, 1));
-    let without = ServerConfig {
-        world: WorldSettings {
-            states_symmetries: true,
-            ..WorldSettings::default()
-        },
-        ..ServerConfig::default()
-    };
     let words = "states_offset: expected 0 to 3, as the shortest sequence allows, got 4";
-    for (config, words) in [
+    let alone = "states_symmetries: expected false without a states file";
+    for (given, words) in [
         (config(4), words),
-        (
-            without,
-            "states_symmetries: expected false without a states file",
-        ),
+        (json!({"states_symmetries": true}), alone),
     ] {
-        let error = config.check().expect_err(words).to_string();
+        let error = check(given).expect_err(words).to_string();
         assert!(error.contains(words), "{error}");
     }
 }

@@ -57,7 +57,6 @@ impl StopCommand {
         self.ask(&Request::Shutdown {}).map(drop)
     }
 
-    /// Sends a request. Returns the server's description, from the handshake, and its reply.
     fn ask(&self, request: &Request) -> Result<(ServerInfo, Reply)> {
         let instance = Instance::new(&self.instance)?;
         let mut connection = Connection::open(&instance, "emberwatch-server", TIMEOUT)?;

@@ -118,9 +118,6 @@ pub struct FirstWorlds {
 
 /// Loads the worlds that a server starts with. Skips damaged files in a folder. Returns `None` if the server should
 /// create new worlds.
-///
-/// # Errors
-/// If all files are damaged, or the latest intact one does not fit.
 pub fn first_worlds(checked: &Checked, spec: &WorldSpec) -> Result<Option<FirstWorlds>, FileError> {
     if checked.config.restore.is_empty() {
         return Ok(None);

@@ -8,7 +8,6 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 
 pub struct Completions<T> {
     pub results: Receiver<T>,
-    /// A descriptor that is readable if `results` may contain something.
     signal: Arc<OwnedFd>,
 }
 
@@ -51,7 +50,6 @@ impl<T> Completions<T> {
         self.results.try_iter().collect()
     }
 
-    /// Returns a descriptor that is readable while results wait to be taken.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.signal.as_fd()
     }

@@ -7,7 +7,6 @@ use std::os::fd::BorrowedFd;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
-/// Maximum number of unfinished jobs.
 const MAX_JOBS: u64 = 16;
 
 pub type FileResult = (u64, Result<Done, FileError>);
@@ -75,7 +74,6 @@ impl Files {
         }
     }
 
-    /// Returns a descriptor that is readable while finished jobs wait to be taken.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.finished.descriptor()
     }

@@ -49,7 +49,6 @@ impl Server {
         self.answer_pending(now);
     }
 
-    /// Warns once if no cell of a new world is in the state with the highest reward.
     fn warn_of_barren(&mut self, world: usize, episode: &Episode) {
         let is_recorded = self.simulator.is_recorded();
         if self.has_warned_of_barren || is_recorded || episode.outcome().n_target_cells > 0 {

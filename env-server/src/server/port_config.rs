@@ -7,9 +7,7 @@ use emberwatch_protocol::payload::ROBOT_BYTES;
 pub struct PortConfig {
     pub instance: Instance,
     pub n_cells: usize,
-    /// Maximum length of a sample on `frames`, in bytes.
     pub frame_bytes: usize,
-    /// Maximum length of an answer on `step`, in bytes.
     pub answer_bytes: usize,
     pub publish_truth: bool,
 }

@@ -183,7 +183,6 @@ impl Ports {
         self.warn_of(sent, "a frame was not published");
     }
 
-    /// Publishes hidden states, if the server is configured to do so.
     pub fn publish_truth(&self, header: TruthHeader, states: &[u8]) {
         let Some(truth) = &self.truth else { return };
         let (_, n_readers) = self.observers();
@@ -217,7 +216,6 @@ impl Ports {
         self.list_observers(|observer| observer.subscriber_id.value())
     }
 
-    /// Returns the nodes of clients with an open connection and of observers.
     pub fn nodes(&self) -> HashSet<u128> {
         let mut nodes = self.client_nodes();
         nodes.extend(self.list_observers(|observer| observer.node_id.value()));
@@ -239,7 +237,6 @@ impl Ports {
         list
     }
 
-    /// Connects to new observers and disconnects from those that have left.
     pub fn connect_observers(&self) {
         // Errors are ignored: if connecting to one observer fails, only that observer receives nothing.
         let _ = self.frames.update_connections();
@@ -264,12 +261,10 @@ impl Ports {
         nodes
     }
 
-    /// Discards pending wake-ups and returns whether there were any.
     pub fn drain(&self) -> Result<bool, ChannelError> {
         drain(&self.listener)
     }
 
-    /// Returns a descriptor that is readable while wake-ups are pending.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         descriptor(&self.listener)
     }

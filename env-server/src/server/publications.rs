@@ -11,7 +11,6 @@ use std::ops::Range;
 #[derive(Default)]
 pub struct Publications {
     observers: Vec<u128>,
-    /// Worlds still to be published for new observers.
     for_new: Range<usize>,
     n_frames: u64,
     n_truths: u64,

@@ -37,7 +37,6 @@ impl Resets {
         self.finished.take()
     }
 
-    /// Returns a descriptor that is readable while finished resets wait to be taken.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.finished.descriptor()
     }

@@ -26,7 +26,6 @@ use std::hash::BuildHasher;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// How long a server waits for its file jobs before it ends.
 const LAST_FILES: Duration = Duration::from_secs(10);
 
 pub(super) struct Server {
@@ -36,7 +35,6 @@ pub(super) struct Server {
     pub(super) clients: Clients,
     pub(super) exit_with: Option<WatchedProcess>,
     pub(super) resets: Resets,
-    /// Step requests that wait for the paths of other clients.
     pub(super) waiting_steps: Vec<(Ticket, ActiveStep)>,
     pub(super) pending_replies: Vec<(ActiveControl, PendingReply)>,
     pub(super) files: Files,

@@ -16,7 +16,6 @@ pub const MAX_INTENT_BYTES: usize = 65_536;
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Intent {
     pub policy: String,
-    /// The estimator that computed the belief.
     pub belief_from: String,
     pub objective: String,
     pub states: Vec<String>,

@@ -28,9 +28,6 @@ pub trait Backend {
     ) -> Result<StepAnswer, ConnectionError>;
 
     /// Answers a control request in JSON with a reply in JSON.
-    ///
-    /// # Errors
-    /// The same as [`Self::step`].
     fn control_text(&mut self, text: &[u8], timeout: Duration) -> Result<Vec<u8>, ConnectionError>;
 
     fn control(&mut self, request: &Request, timeout: Duration) -> Result<Reply, ConnectionError> {

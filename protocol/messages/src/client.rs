@@ -68,12 +68,10 @@ impl<B: Backend> Client<B> {
         self.backend.info()
     }
 
-    /// Returns the backend (a connection, or worlds in this process), for requests that have no method here.
     pub fn backend(&mut self) -> &mut B {
         &mut self.backend
     }
 
-    /// Returns the lease's number, for requests that have no method here.
     pub fn lease(&self) -> u64 {
         self.lease.number()
     }
@@ -93,7 +91,6 @@ impl<B: Backend> Client<B> {
         left_belief::leave(&mut self.backend, place, at, kind, bytes, STEP_TIMEOUT)
     }
 
-    /// Returns the belief of this kind that was left for a robot (see [`left_belief::load`]).
     pub fn left_belief(
         &mut self,
         robot: u32,
@@ -132,9 +129,6 @@ impl<B: Backend> Client<B> {
 
     /// Flies as [`Self::step`] does, but returns `None` if `is_over` returns true before the worlds have moved.
     /// `is_over` is called periodically, at intervals of [`STEP_TIMEOUT`] plus the server's deadline.
-    ///
-    /// # Errors
-    /// The same as [`Self::step`].
     pub fn step_until(
         &mut self,
         robots: Range<u32>,
@@ -158,9 +152,6 @@ impl<B: Backend> Client<B> {
     }
 
     /// Observes robots and their worlds without changing anything. The robots may be held by other clients.
-    ///
-    /// # Errors
-    /// A refusal if the server has no such robot.
     pub fn observe(&mut self, robots: Range<u32>) -> Result<Vec<Observation>, ConnectionError> {
         let request = self.request(Operation::Observe, &robots);
         self.send(Call::new(request, &[], STEP_TIMEOUT))
@@ -207,9 +198,6 @@ impl<B: Backend> Client<B> {
 
     /// Flies as [`Self::step`] does, with the moves of all paths as bytes. Returns the answer's bytes, without a copy
     /// for each robot: the fastest way to step.
-    ///
-    /// # Errors
-    /// The same as [`Self::step`].
     pub fn step_bytes(
         &mut self,
         robots: &Range<u32>,

@@ -22,9 +22,7 @@ pub enum Request {
     /// Acquire the right to fly consecutive robots.
     Acquire {
         first_robot: u32,
-        /// Number of robots, at least 1.
         n_robots: u32,
-        /// Whether to take the robots from other clients that hold them.
         #[serde(default)]
         takeover: bool,
         /// Time from the last use of the lease until it ends; `None` for the server's default.
@@ -41,21 +39,19 @@ pub enum Request {
     /// Write worlds to a file on the server's machine.
     Snapshot {
         first_world: u32,
-        /// Number of worlds, at least 1.
         n_worlds: u32,
-        /// The file, an absolute path.
+        /// An absolute path.
         path: String,
     },
     /// Replace worlds of the lease with worlds from a snapshot file.
     Restore {
         lease: u64,
         first_world: u32,
-        /// Number of worlds, at least 1.
         n_worlds: u32,
         /// The first world to read, as an index in the file.
         #[serde(default)]
         from: u32,
-        /// The file, an absolute path.
+        /// An absolute path.
         path: String,
     },
     /// Replace a world of the lease with a copy of another world.
@@ -87,9 +83,7 @@ pub struct WorldSeed {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "reply", rename_all = "snake_case")]
 pub enum Reply {
-    /// Answers `hello`.
     Hello(Box<ServerInfo>),
-    /// Answers `acquire` and `renew`.
     Lease(LeaseInfo),
     /// Answers `release`, `leave_belief` and `shutdown`.
     Done,
@@ -107,10 +101,8 @@ pub enum Reply {
     },
     /// Answers `restore` and `fork`: the worlds after the replacement.
     Restored {
-        /// One entry per replaced world.
         worlds: Vec<WorldInfo>,
     },
-    /// Answers `belief`.
     Belief {
         #[serde(flatten)]
         info: BeliefInfo,
@@ -127,10 +119,8 @@ pub enum Reply {
     },
 }
 
-/// A lease that was granted or extended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeaseInfo {
-    /// The lease's number, which each step request contains.
     pub lease: u64,
     /// Time from the last use of the lease until it ends.
     pub ttl_millis: u64,
@@ -139,7 +129,6 @@ pub struct LeaseInfo {
     pub worlds: Vec<WorldInfo>,
 }
 
-/// A part of a belief to store, and the step of its world.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LeftPart {
@@ -157,25 +146,21 @@ pub struct LeftPart {
     pub data: String,
 }
 
-/// A belief that was stored for a robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BeliefInfo {
     pub kind: String,
     pub seed: u64,
     pub episode: u64,
-    /// The step at which the belief was stored.
     pub step: u64,
     pub length: u64,
 }
 
-/// The current episode and step of a world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WorldInfo {
     pub world: u32,
     /// Step index k.
     pub step: u64,
     pub seed: u64,
-    /// The episode: the number of resets of the world since the server started.
     pub episode: u64,
     /// `[row, col]` of each of the world's robots.
     pub robots: Vec<[u32; 2]>,
@@ -207,7 +192,6 @@ pub struct WorldStatus {
 }
 
 impl Reply {
-    /// Returns a refusal with the standard message of its status.
     pub fn refusal(status: Status, detail: u64) -> Self {
         Self::error(status, detail, status.explain(detail))
     }

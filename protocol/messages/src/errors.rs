@@ -69,7 +69,6 @@ pub enum ChannelError {
     )]
     NoDescriptors {
         what: &'static str,
-        /// Number of file descriptors that the operation needs.
         needed: usize,
         limit: String,
     },

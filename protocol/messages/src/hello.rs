@@ -15,9 +15,7 @@ pub struct ServerInfo {
     /// within this namespace.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pid_namespace: Option<u64>,
-    /// Grid height H.
     pub height: usize,
-    /// Grid width W.
     pub width: usize,
     pub n_moves: usize,
     pub n_worlds: u32,
@@ -43,7 +41,7 @@ pub struct ServerInfo {
     pub recorded_world: Option<RecordedWorld>,
     /// Number of steps simulated from the initial distribution before k = 0.
     pub burn_in: u64,
-    /// Length of an episode in steps; 0 if episodes are never truncated.
+    /// 0 if episodes are never truncated.
     pub max_steps: u64,
     pub max_clients: usize,
     pub coverage: CoverageRule,
@@ -58,17 +56,11 @@ pub struct ServerInfo {
 
 impl ServerInfo {
     /// Returns the height and width of the grid.
-    ///
-    /// # Errors
-    /// If a side is outside `1..=MAX_SIDE`.
     pub fn shape(&self) -> Result<Shape, ShapeError> {
         Shape::new(self.height, self.width)
     }
 
     /// Returns where robots may fly and what they see.
-    ///
-    /// # Errors
-    /// If the map does not fit the grid, or a number is out of range. The error contains the expected value.
     pub fn airspace(&self) -> Result<Airspace, String> {
         let shape = self.shape().map_err(|error| error.to_string())?;
         match &self.airspace {
@@ -147,7 +139,6 @@ impl AirspaceInfo {
     }
 }
 
-/// Returns the values of a map if it fits the grid.
 fn of_grid(what: &str, shape: Shape, rows: &[Vec<u8>]) -> Result<Grid<u8>, String> {
     let fits = rows.len() == shape.height() && rows.iter().all(|row| row.len() == shape.width());
     if !fits {

@@ -20,7 +20,6 @@ impl Instance {
         }
     }
 
-    /// Returns the name as users write it.
     pub fn name(&self) -> &str {
         &self.0
     }

@@ -15,10 +15,8 @@ use std::time::Duration;
 #[derive(Debug)]
 pub struct Lease {
     number: u64,
-    /// Number of robots of each world.
     team: u32,
     n_moves: u32,
-    /// Time that a step waits for teammates.
     deadline: Duration,
     worlds: Range<u32>,
     known: Vec<Known>,
@@ -31,7 +29,6 @@ pub struct Lease {
 pub struct Claim {
     /// The numbers of the robots, at least one.
     pub robots: Range<u32>,
-    /// Whether to take the robots from other clients that hold them.
     pub takeover: bool,
     /// Time from the last use of the lease until it ends, 0.1 s to one day; `None` for the server's default.
     pub time_to_live: Option<Duration>,
@@ -60,7 +57,6 @@ struct Known {
 #[derive(Debug)]
 pub struct Call<'a> {
     request: StepRequest,
-    /// The moves of all paths.
     moves: &'a [u8],
     /// For each world, the step that its paths are for; empty until the call is first sent.
     steps: Vec<u64>,
@@ -91,7 +87,6 @@ impl<'a> Call<'a> {
         Self { steps, ..call }
     }
 
-    /// Returns the request, without the fields that [`Backend::step`] fills in.
     pub fn request(&self) -> &StepRequest {
         &self.request
     }
@@ -130,9 +125,6 @@ impl Lease {
     }
 
     /// Starts new episodes with the given seeds. Returns the worlds when the burn-in is done.
-    ///
-    /// # Errors
-    /// `Busy` if another client holds a robot of these worlds, and `NoLease` if this lease holds none.
     pub fn reset(
         &self,
         backend: &mut dyn Backend,
@@ -166,9 +158,6 @@ impl Lease {
     }
 
     /// Replaces the world `to` with a copy of the world `from`. With the same paths, both have the same future.
-    ///
-    /// # Errors
-    /// As for [`Self::reset`].
     pub fn fork(
         &self,
         backend: &mut dyn Backend,
@@ -180,9 +169,6 @@ impl Lease {
     }
 
     /// Restarts the time until the lease expires, without flying.
-    ///
-    /// # Errors
-    /// `LeaseLost` if the lease no longer holds any robot.
     pub fn renew(
         &self,
         backend: &mut dyn Backend,
@@ -195,9 +181,6 @@ impl Lease {
     }
 
     /// Returns the robots to the server.
-    ///
-    /// # Errors
-    /// `LeaseLost` if the lease no longer holds any robot.
     pub fn release(
         &self,
         backend: &mut dyn Backend,
@@ -279,9 +262,6 @@ impl Lease {
 
     /// Sends a request once, and records the steps in its answer. When a call is first sent, its paths are assigned to
     /// the last known steps of their worlds.
-    ///
-    /// # Errors
-    /// The same as [`Backend::step`].
     pub fn send(
         &self,
         backend: &mut dyn Backend,

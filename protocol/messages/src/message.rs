@@ -40,17 +40,14 @@ headers!(
 
 /// A header of samples that a server or an agent publishes.
 pub trait Published: Header {
-    /// Returns the sender's protocol version.
     fn version(&self) -> u32;
 
-    /// Returns the number of the world.
     fn world(&self) -> u32;
 
     /// Returns the number of earlier samples of the same sender. A gap means lost samples.
     fn sequence(&self) -> u64;
 }
 
-/// Implements [`Published`] for headers with these fields.
 macro_rules! published {
     ($($header:ident),*) => {$(
         impl Published for $header {
@@ -84,7 +81,6 @@ pub struct StepRequest {
     pub operation: u32,
     /// The lease from `acquire`; ignored by `Observe` and `Recall`.
     pub lease: u64,
-    /// Chosen by the client, and repeated in the answer.
     pub sequence: u64,
     /// Number of the first robot.
     pub first_robot: u32,
@@ -112,13 +108,11 @@ pub struct StepReply {
     pub status: u32,
     /// The request's sequence number.
     pub sequence: u64,
-    /// Number of the first robot, from the request.
     pub first_robot: u32,
     /// Number of robots in the payload; 0 unless the status is `Ok`.
     pub n_robots: u32,
     /// Number of worlds of these robots; 0 unless the status is `Ok`.
     pub n_worlds: u32,
-    /// The request's flags.
     pub flags: u32,
     /// Grid height H.
     pub height: u32,
@@ -188,7 +182,6 @@ pub struct RobotResult {
 }
 
 impl RobotResult {
-    /// Returns the robot's cell.
     pub fn cell(&self) -> Cell {
         Cell {
             row: self.row as usize,
@@ -213,7 +206,6 @@ pub struct ControlRequest {
     pub version: u32,
     /// Reserved; always 0.
     pub reserved: u32,
-    /// Chosen by the client, and repeated in the answer.
     pub sequence: u64,
     /// Low half of the id of the client's listener on `wake-client`. If both halves are 0, the server sends no wake-up.
     pub listener_low: u64,

@@ -6,7 +6,6 @@ use emberwatch_model::frame::Frame;
 /// A robot's observation of its world after a step, or when the robot is acquired.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// The world at its step k.
     pub world: WorldResult,
     /// The robot's cell, and its result of the step.
     pub robot: RobotResult,

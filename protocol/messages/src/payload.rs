@@ -11,13 +11,10 @@ use emberwatch_model::frame::UNOBSERVED;
 use emberwatch_model::grid::{Grid, Shape};
 use emberwatch_model::path::MAX_MOVES;
 
-/// Size of one [`WorldResult`] in a payload in bytes.
 pub const WORLD_BYTES: usize = size_of::<WorldResult>();
 
-/// Size of one [`RobotResult`] in a payload in bytes.
 pub const ROBOT_BYTES: usize = size_of::<RobotResult>();
 
-/// The payload of a successful step answer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepParts<'a> {
     pub worlds: Vec<WorldResult>,
@@ -32,7 +29,6 @@ pub type FrameParts<'a> = Vec<RobotSample<'a>>;
 /// The part of a sample on `frames` that is about one robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RobotSample<'a> {
-    /// The robot's result of the step.
     pub result: RobotResult,
     /// The robot's frame, `height * width` bytes.
     pub frame: &'a [u8],
@@ -43,9 +39,6 @@ pub struct RobotSample<'a> {
 impl StepParts<'_> {
     /// Checks that only existing robots are marked as having stayed, that paths are complete, and that frames contain
     /// only valid observations.
-    ///
-    /// # Errors
-    /// Describes the first wrong value.
     pub fn check(&self, info: &ServerInfo) -> Result<(), String> {
         let n_robots = info.n_robots.clamp(1, MAX_ROBOTS as u32) as usize;
         let stayed = self.worlds.iter().map(|world| world.hovered | world.late);
@@ -159,9 +152,6 @@ pub fn split_frame_payload<'a>(
 }
 
 /// Returns the hidden states in a sample on `truth`.
-///
-/// # Errors
-/// If the payload does not fit the header. The error contains the expected value.
 pub fn truth_states(sample: &Sample<TruthHeader>) -> Result<Grid<u8>, String> {
     let header = &sample.header;
     let shape = Shape::new(header.height as usize, header.width as usize);

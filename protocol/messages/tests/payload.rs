@@ -88,55 +88,27 @@ fn a_sample_gives_each_robot_its_frame_and_path() {
         (&[0, 255, 2][..], &[3, 3][..])
     );
 
-    let check = |header: FrameHeader, payload: &[u8], words: &str| {
-        let error = split_frame_payload(&header, payload).expect_err(words);
+    type Change = fn(&mut FrameHeader, &mut Vec<u8>);
+    let changes: [(Change, &str); 9] = [
+        (|_, bytes| bytes.truncate(103), "expected 104, got 103"),
+        (|_, bytes| bytes.push(0), "expected 104, got 105"),
+        (|_, bytes| bytes.truncate(95), "expected 102, got 95"),
+        (|it, _| it.n_robots = 0, "robots: expected 1 to 64, got 0"),
+        (|it, _| it.n_robots = 65, "robots: expected 1 to 64, got 65"),
+        (|it, _| it.width = 0, "got 1 x 0"),
+        (|it, _| it.height = u32::MAX, "got 4294967295 x 3"),
+        (|it, _| it.result.late = 4, "expected bits below 2, got 0x4"),
+        (fly_far, "path: expected at most 4096 moves, got 4097"),
+    ];
+    for (change, words) in changes {
+        let (mut header, mut payload) = (header, payload.clone());
+        change(&mut header, &mut payload);
+        let error = split_frame_payload(&header, &payload).expect_err(words);
         assert!(error.contains(words), "{error}");
-    };
-    check(
-        header,
-        &payload[..103],
-        "payload bytes: expected 104, got 103",
-    );
-    check(
-        header,
-        &[&payload[..], &[0]].concat(),
-        "payload bytes: expected 104, got 105",
-    );
-    check(
-        header,
-        &payload[..95],
-        "payload bytes: expected 102, got 95",
-    );
-    let changed = |change: fn(&mut FrameHeader)| {
-        let mut changed = header;
-        change(&mut changed);
-        changed
-    };
-    check(
-        changed(|it| it.n_robots = 0),
-        &payload,
-        "robots: expected 1 to 64, got 0",
-    );
-    check(
-        changed(|it| it.n_robots = 65),
-        &payload,
-        "robots: expected 1 to 64, got 65",
-    );
-    check(changed(|it| it.width = 0), &payload, "got 1 x 0");
-    check(
-        changed(|it| it.height = u32::MAX),
-        &payload,
-        "got 4294967295 x 3",
-    );
-    check(
-        changed(|it| it.result.late = 4),
-        &payload,
-        "expected bits below 2, got 0x4",
-    );
-    let long = [bytemuck::bytes_of(&flew(4097)), &[0; 4100]].concat();
-    check(
-        changed(|it| it.n_robots = 1),
-        &long,
-        "path: expected at most 4096 moves, got 4097",
-    );
+    }
+}
+
+fn fly_far(header: &mut FrameHeader, payload: &mut Vec<u8>) {
+    header.n_robots = 1;
+    *payload = [bytemuck::bytes_of(&flew(4097)), &[0; 4100]].concat();
 }

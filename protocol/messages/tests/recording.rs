@@ -92,19 +92,13 @@ fn written() -> (Vec<u8>, Vec<usize>) {
 
 /// Returns the readable records, and the error that ends them, if any.
 fn read(bytes: &[u8]) -> (Vec<Record>, Option<RecordingError>) {
-    let mut records = Vec::new();
-    match Reader::new(bytes) {
-        Ok(reader) => {
-            for record in reader {
-                match record {
-                    Ok(record) => records.push(record),
-                    Err(error) => return (records, Some(error)),
-                }
-            }
-            (records, None)
-        }
-        Err(error) => (records, Some(error)),
-    }
+    let reader = match Reader::new(bytes) {
+        Ok(reader) => reader,
+        Err(error) => return (Vec::new(), Some(error)),
+    };
+    let mut error = None;
+    let good = reader.map_while(|record| record.map_err(|it| error = Some(it)).ok());
+    (good.collect(), error)
 }
 
 /// Counts the records of steps, which are frames with k > 0. The example contains no step twice.
@@ -143,11 +137,9 @@ fn sealed(kind: u32, stored: &[u8]) -> Vec<u8> {
 #[test]
 fn what_was_written_is_read_with_its_losses() {
     let (bytes, _) = written();
-    let (records, error) = read(&bytes);
-    assert_eq!(records, example());
-    assert!(error.is_none(), "{error:?}");
     let mut reader = Reader::new(&bytes[..]).expect("begin");
-    assert!(reader.by_ref().all(|record| record.is_ok()));
+    let records: Result<Vec<Record>, _> = reader.by_ref().collect();
+    assert_eq!(records.expect("undamaged"), example());
     let expected = Totals {
         n_servers: 2,
         n_frames: 3,
@@ -171,16 +163,15 @@ fn a_cut_recording_is_read_to_its_last_whole_record() {
             (length - offset) as u64,
             count_steps(&records),
         );
-        match error {
-            Some(RecordingError::Cut {
-                offset,
-                got,
-                n_steps,
-            }) => {
-                assert_eq!((offset, got, n_steps), expected);
-            }
-            other => panic!("cut after {length} bytes: {other:?}"),
-        }
+        let Some(RecordingError::Cut {
+            offset,
+            got,
+            n_steps,
+        }) = error
+        else {
+            panic!("cut after {length} bytes: {error:?}")
+        };
+        assert_eq!((offset, got, n_steps), expected);
     }
 }
 
@@ -274,10 +265,7 @@ fn a_writer_refuses_what_a_reader_would() {
         { *it = frame(1, (3, 2), [0, 0], &[0; 12]); } "grid: expected 2 x 3, got 3 x 2"
         { *it = frame(1, (2, 3), [1, 0], &[0; 13]); } "expected 0 or 4 moves, got 1"
         { it.payload.push(0); } "payload bytes: expected 112, got 113"
-        { it.header.n_robots = 1; } "payload bytes: expected 54, got 112"
-        { it.header.n_robots = 65; } "robots: expected 1 to 64, got 65"
         { it.header.first_robot = 3; } "first robot: expected 2, got 3"
-        { it.header.result.hovered = 4; } "expected bits below 2, got 0x4"
         { let _ = it; } ""
     } {
         let mut sample = good.clone();

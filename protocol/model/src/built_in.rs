@@ -4,7 +4,6 @@
 /// Built-in models, as `(name, text of the file)`.
 pub(crate) static MODELS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/models.rs"));
 
-/// Built-in tasks, as `(name, text of the file)`.
 pub(crate) static TASKS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/tasks.rs"));
 
 /// Built-in recorded states, as `(name, archive of sequences, text of the description)`.

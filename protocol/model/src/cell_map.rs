@@ -9,14 +9,12 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// A number for each cell of a grid.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(
     untagged,
     expecting = "expected rows of numbers from 0 to 255, or the name of a .npy file"
 )]
 pub enum CellMap {
-    /// Row by row.
     Rows(Vec<Vec<u8>>),
     /// The name of a `.npy` file next to the model file, with shape `[H, W]` and type `uint8` or `bool`.
     File(String),
@@ -55,9 +53,6 @@ impl CellMap {
     }
 
     /// Replaces the name of a `.npy` file with the numbers that it contains. The file is next to the model file.
-    ///
-    /// # Errors
-    /// If the file cannot be read. The error contains its path and the reason.
     pub(super) fn read_beside(&mut self, model: &Path) -> Result<(), (PathBuf, String)> {
         let Self::File(name) = &*self else {
             return Ok(());

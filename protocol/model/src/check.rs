@@ -16,7 +16,6 @@ use std::ops::RangeInclusive;
 /// overflow nor vanish in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
-/// Maximum factor of a map.
 const MAX_FACTOR: f32 = 1e6;
 
 /// Reserved names, which no state may have. A policy's goal is either the name of a state or one of these words.
@@ -114,7 +113,6 @@ impl Checker<'_> {
         Ok(file.states.iter().map(value).collect())
     }
 
-    /// Checks that a number is 0, or that its magnitude is in [`RANGE`].
     fn magnitude(&self, what: String, got: f64, is_zero: bool) -> Result<(), ModelError> {
         if is_zero || RANGE.contains(&got.abs()) {
             return Ok(());

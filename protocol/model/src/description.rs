@@ -12,15 +12,11 @@ pub struct Description {
     pub name: String,
     /// Duration of one step, as text for display.
     pub step: String,
-    /// No-fly map with 1 for each cell closed to robots, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<CellMap>,
-    /// The sensor, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<SensorEntry>,
-    /// The states, in the order of their values.
     pub states: Vec<DescribedState>,
-    /// The observations, in the order of their values.
     pub observations: Vec<ObservationEntry>,
 }
 
@@ -28,22 +24,15 @@ pub struct Description {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DescribedState {
-    /// Name, unique among the states.
     pub name: String,
-    /// Colour in pictures, `#rrggbb`.
     pub color: String,
-    /// Reward for each distinct visited cell in this state.
     #[serde(default)]
     pub reward: f64,
-    /// `P(y | this state)`, one entry per observation (eq. 1).
     pub observed_as: Vec<f64>,
 }
 
 impl Description {
     /// Builds a model with these states, observations and rewards. In this model, no cell ever changes its state.
-    ///
-    /// # Errors
-    /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn unchanging(&self) -> Result<Model, ModelError> {
         let share = 1.0 / self.states.len().max(1) as f64;
         let state = |state: &DescribedState| StateEntry {
@@ -75,9 +64,6 @@ impl Description {
     }
 
     /// Parses a description and builds its unchanging model.
-    ///
-    /// # Errors
-    /// If the text is not a valid description, or an entry is wrong.
     pub fn model_of(text: &str) -> Result<Model, ModelError> {
         toml::from_str::<Self>(text)?.unchanging()
     }

@@ -9,27 +9,22 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use thiserror::Error;
 
-/// Maximum number of states, and of observations: 64.
 pub const MAX_VALUES: usize = 64;
 
-/// Maximum side of a kernel: 15 cells.
 pub const MAX_KERNEL_SIDE: usize = 15;
 
 /// Minimum sum of a cell's weights, relative to the largest weight. The smallest normal `f32` is 1e-38, so larger sums
 /// keep their precision.
 pub(super) const LEAST_SHARE: f64 = 1e-30;
 
-/// Minimum probability of a transition that is not 0: 1e-9.
 pub const MIN_PROBABILITY: f64 = 1e-9;
 
-/// Maximum radius of a sensor: 8 cells.
 pub const MAX_RADIUS: usize = 8;
 
 /// A model as written in TOML; [`super::Model::new`] checks it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelFile {
-    /// Name for display.
     pub name: String,
     /// Number of rows and columns of the transition kernel, both odd. Only for models with `kernel`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -58,7 +53,6 @@ pub struct ModelFile {
     pub transitions: Vec<TransitionEntry>,
 }
 
-/// One state of a model file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StateEntry {
@@ -78,11 +72,9 @@ pub struct StateEntry {
     pub observed_as: Vec<f64>,
 }
 
-/// One observation of a model file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObservationEntry {
-    /// Name, unique among the observations.
     pub name: String,
     /// Colour in pictures, `#rrggbb`.
     pub color: String,
@@ -136,14 +128,11 @@ pub struct TransitionEntry {
     pub near: BTreeMap<String, Vec<Vec<f64>>>,
 }
 
-/// The reason for rejecting a model file.
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// The text is not TOML, or lacks the structure of a model file.
     #[error("model file: {0}")]
     Toml(String),
-    /// There are too few or too many states or observations.
     #[error(
         "model {:?}: expected {least} to {most} {what}, got {got}",
         shortened(model)
@@ -155,7 +144,6 @@ pub enum ModelError {
         most: usize,
         got: usize,
     },
-    /// Two entries have the same name.
     #[error(
         "model {:?}: {what} name {:?} appears twice",
         shortened(model),
@@ -166,10 +154,8 @@ pub enum ModelError {
         what: &'static str,
         name: String,
     },
-    /// A file cannot be read.
     #[error("{}: {problem}", shortened(path))]
     File { path: String, problem: String },
-    /// An entry has a wrong value.
     #[error(
         "model {:?}: {}: expected {expected}, got {}",
         shortened(model),
@@ -241,9 +227,6 @@ impl From<toml::de::Error> for ModelError {
 
 impl ModelFile {
     /// Reads a model file, and the map files in its folder. [`super::Model::new`] checks the entries.
-    ///
-    /// # Errors
-    /// If a file cannot be read or parsed.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         let failed = |key: &str, path: &Path, problem: String| ModelError::File {
             path: format!("{key}{}", path.display()),

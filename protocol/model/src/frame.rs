@@ -29,10 +29,8 @@ pub struct Frame {
     values: Grid<u8>,
 }
 
-/// The error for bytes that are not a frame of the expected grid.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum FrameError {
-    /// Wrong number of bytes.
     #[error("frame: expected {expected} bytes for a {shape} grid, got {got}")]
     Length {
         expected: usize,
@@ -58,9 +56,6 @@ impl Frame {
     }
 
     /// Decodes `H * W` row-major bytes. One invalid byte makes the whole frame invalid.
-    ///
-    /// # Errors
-    /// [`FrameError`] for a wrong length or a value that is not an observation.
     pub fn from_bytes(
         shape: Shape,
         n_observations: usize,
@@ -97,7 +92,7 @@ impl Frame {
         self.values.view()
     }
 
-    /// Returns the values as `H * W` row-major bytes.
+    /// Returns `H * W` row-major bytes.
     pub fn as_bytes(&self) -> &[u8] {
         self.values
             .as_slice()

@@ -25,7 +25,6 @@ pub struct Shape {
     width: usize,
 }
 
-/// One cell of a grid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Cell {
     /// Row, 0 at the top.
@@ -34,7 +33,6 @@ pub struct Cell {
     pub col: usize,
 }
 
-/// The error for a height or width outside `1..=MAX_SIDE`.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("grid shape: expected height and width in 1..={MAX_SIDE}, got {height} x {width}")]
 pub struct ShapeError {
@@ -43,10 +41,6 @@ pub struct ShapeError {
 }
 
 impl Shape {
-    /// Checks both sides and makes a shape.
-    ///
-    /// # Errors
-    /// [`ShapeError`] if a side is outside `1..=MAX_SIDE`.
     pub fn new(height: usize, width: usize) -> Result<Self, ShapeError> {
         let side = 1..=MAX_SIDE;
         if side.contains(&height) && side.contains(&width) {
@@ -78,7 +72,6 @@ impl Shape {
         cell.row * self.width + cell.col
     }
 
-    /// Returns the cell at a row-major index.
     pub fn cell(self, index: usize) -> Cell {
         debug_assert!(index < self.n_cells());
         Cell {

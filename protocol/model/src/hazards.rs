@@ -12,7 +12,6 @@ use super::grid::{Cell, Grid, Shape};
 use super::maps::Maps;
 use ndarray::{Array4, ArrayD, Ix2, Ix4};
 
-/// The transitions of a model, and its maps.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hazards {
     /// Number of rows and columns of the smallest table that contains all neighbours.
@@ -28,13 +27,10 @@ pub struct Transition {
     pub to: usize,
     /// The hazard without neighbours; infinite if the transition is certain.
     pub base: f64,
-    /// The hazards of neighbours.
     pub near: Vec<Near>,
-    /// What multiplies the hazards in each cell.
     pub factors: Factors,
 }
 
-/// The hazard of one neighbour in one state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Near {
     pub state: usize,
@@ -44,7 +40,6 @@ pub struct Near {
     pub hazard: f64,
 }
 
-/// Factors of the hazards of a transition in each cell.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Factors {
     /// The factors of all hazards, shape `[H, W]`.
@@ -59,7 +54,6 @@ impl Hazards {
         self.size
     }
 
-    /// Returns the transitions of cells in a state, in order.
     pub fn transitions(&self, from: usize) -> &[Transition] {
         &self.transitions[from]
     }
@@ -86,14 +80,12 @@ impl Hazards {
         &self.maps
     }
 
-    /// Returns the grid of the maps, if there are maps.
     pub fn shape(&self) -> Option<Shape> {
         self.shape
     }
 }
 
 impl Factors {
-    /// Returns whether all factors are 1.
     pub fn are_one(&self) -> bool {
         self.of_cells.is_none() && self.of_neighbours.is_none()
     }

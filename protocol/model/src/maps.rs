@@ -23,7 +23,6 @@ pub const MAX_MAP_VALUES: usize = 1 << 26;
 /// The maps by name, each of shape `[H, W]` or `[KH, KW, H, W]`.
 pub type Maps = BTreeMap<String, ArrayD<f32>>;
 
-/// The entry `maps` of a model file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(
     untagged,
@@ -34,10 +33,7 @@ pub enum MapsEntry {
     /// The name of an `.npz` file next to the model file.
     File(String),
     /// The compressed archive itself, with which the model can be sent to other processes.
-    Packed {
-        /// The bytes in base64.
-        npz: String,
-    },
+    Packed { npz: String },
 }
 
 impl MapsEntry {
@@ -77,9 +73,6 @@ impl MapsEntry {
     }
 
     /// Replaces the name of a file with its packed maps. The file is next to the model file.
-    ///
-    /// # Errors
-    /// If the file cannot be read. The error contains its path and the reason.
     pub(super) fn read_beside(&mut self, model: &Path) -> Result<(), (PathBuf, String)> {
         let Self::File(name) = &*self else {
             return Ok(());
@@ -140,7 +133,6 @@ fn read_archive(bytes: &[u8]) -> Result<Maps, String> {
     Ok(maps)
 }
 
-/// Reads an array of any usual type with at most `most` values.
 fn numbers(bytes: &[u8], most: usize) -> Result<ArrayD<f32>, String> {
     let array = Npy::new(bytes)?;
     let n_values = array.n_values();

@@ -9,20 +9,13 @@ use std::io::Cursor;
 /// parser's stack.
 const MAX_HEADER_BYTES: u16 = 512;
 
-/// An array as it is stored.
 pub(super) struct Npy<'b> {
     bytes: &'b [u8],
-    /// The shape that the header states.
     pub shape: Vec<usize>,
-    /// Number of bytes after the header.
     pub n_bytes: usize,
 }
 
 impl<'b> Npy<'b> {
-    /// Reads the header of an array.
-    ///
-    /// # Errors
-    /// If the bytes don't begin with the header of a `.npy` file.
     pub fn new(bytes: &'b [u8]) -> Result<Self, String> {
         let header = match bytes.strip_prefix(b"\x93NUMPY") {
             Some([1, _, low, high, ..]) => u16::from_le_bytes([*low, *high]),
@@ -41,7 +34,7 @@ impl<'b> Npy<'b> {
         })
     }
 
-    /// Returns the number of values that the header states, or `None` if it overflows.
+    /// `None` if it overflows.
     pub fn n_values(&self) -> Option<usize> {
         self.shape
             .iter()

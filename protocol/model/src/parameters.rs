@@ -23,7 +23,6 @@ pub enum Rule {
     Hazards(Arc<Hazards>),
 }
 
-/// The parameters of eq. 2.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ratio {
     kernel: Array4<f64>,
@@ -33,7 +32,6 @@ pub struct Ratio {
 /// A place of a kernel where the weights of two states differ by more than a factor of 2.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UnevenPlace {
-    /// Row and column in the kernel.
     pub place: [usize; 2],
     /// The states with the smallest and the largest weight, summed over the next states.
     pub states: [usize; 2],
@@ -66,7 +64,6 @@ impl Model {
         Some(model.expect("invariant: built-in models are valid, as a test shows"))
     }
 
-    /// Lists the names of the built-in models.
     pub fn built_in_names() -> impl Iterator<Item = &'static str> {
         Self::built_in_files().map(|(name, _)| name)
     }
@@ -77,25 +74,17 @@ impl Model {
     }
 
     /// Reads and checks a model file's text.
-    ///
-    /// # Errors
-    /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn from_toml(text: &str) -> Result<Self, ModelError> {
         Self::new(toml::from_str(text)?)
     }
 
     /// Reads and checks a model file, and the map files in its folder.
-    ///
-    /// # Errors
-    /// If a file cannot be read, or an entry is wrong.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         Self::new(ModelFile::read(path)?)
     }
 
-    /// Replaces the radius of the sensor: the number of rows and columns that it sees around each cell of the path.
-    ///
-    /// # Errors
-    /// If the radius is over 8.
+    /// Replaces the radius of the sensor, the number of rows and columns that it sees around each cell of the path, at
+    /// most 8.
     pub fn with_radius(self, radius: usize) -> Result<Self, ModelError> {
         let sensor = (radius > 0).then_some(SensorEntry { radius });
         Self::new(ModelFile {
@@ -138,10 +127,6 @@ impl Model {
     }
 
     /// Checks that the model's maps fit a grid, and that eq. 3 cannot divide by zero or nearly zero there.
-    ///
-    /// # Errors
-    /// If a map does not fit the grid, or if the weights of a cell can sum to nearly zero. The error names the first
-    /// such cell.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
         let no_fly = self.no_fly.as_ref().map(|map| map.dim());
         let maps = self.hazards().and_then(Hazards::shape).map(Shape::dim);
@@ -215,7 +200,6 @@ impl Model {
         &self.file.name
     }
 
-    /// Returns the entries of the model file, which can be serialised again.
     pub fn file(&self) -> &ModelFile {
         &self.file
     }
@@ -265,15 +249,11 @@ impl Model {
     }
 
     /// Returns the cells where robots may fly, and the cells that they see from there.
-    ///
-    /// # Errors
-    /// If a map does not fit the grid.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, ModelError> {
         self.check_on(shape)?;
         Ok(Airspace::new(shape, self.no_fly.clone(), self.radius()))
     }
 
-    /// Returns the number of rows and columns that the sensor sees beyond each cell of the path.
     pub fn radius(&self) -> usize {
         self.file.sensor.as_ref().map_or(0, |sensor| sensor.radius)
     }

@@ -4,7 +4,6 @@ use super::airspace::Airspace;
 use super::grid::Cell;
 use super::path::Move;
 
-/// Marks a cell that belongs to no part.
 const NONE: u32 = u32::MAX;
 
 /// The free cells of an airspace by connected part. A robot never leaves the part in which it starts.

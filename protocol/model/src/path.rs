@@ -27,17 +27,13 @@ pub struct Flight {
     /// Row-major indices of the distinct cells flown over, in the order of the first visit. The start cell is among
     /// them only if the path returns to it, or if a move off the grid or into a no-fly cell leaves the robot there.
     pub visited: Vec<usize>,
-    /// The robot's last cell.
     pub end: Cell,
 }
 
-/// The error for a byte that is not a move.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("move {index} of the path: expected 0 (up), 1 (down), 2 (left) or 3 (right), got {value}")]
 pub struct MoveError {
-    /// Position in the path.
     pub index: usize,
-    /// The byte found there.
     pub value: u8,
 }
 
@@ -72,9 +68,6 @@ impl TryFrom<u8> for Move {
 }
 
 /// Decodes a path from its wire bytes, one byte per move.
-///
-/// # Errors
-/// [`MoveError`] names the first byte that is not a move.
 pub fn path_from_bytes(bytes: &[u8]) -> Result<Vec<Move>, MoveError> {
     check_moves(bytes)?;
     let moves = bytes.iter().map(|&byte| Move::from_low_bits(byte.into()));
@@ -82,9 +75,6 @@ pub fn path_from_bytes(bytes: &[u8]) -> Result<Vec<Move>, MoveError> {
 }
 
 /// Checks that each byte is a move.
-///
-/// # Errors
-/// [`MoveError`] names the first byte that is not a move.
 pub fn check_moves(bytes: &[u8]) -> Result<(), MoveError> {
     let is_wrong = |byte: &u8| usize::from(*byte) >= Move::ALL.len();
     // One pass without branches, which the compiler turns into vector code.

@@ -18,14 +18,12 @@ pub const MAX_ROBOTS: usize = 64;
 /// The range of settings that accept any unsigned 64-bit number.
 pub const ANY: (i128, i128) = (0, u64::MAX as i128);
 
-/// One setting: a field of a struct of settings.
 #[derive(Debug, Clone, Copy)]
 pub struct Setting {
     /// Name in files, programs and messages. The flag has hyphens instead of underscores.
     pub name: &'static str,
     /// One sentence without a full stop.
     pub help: &'static str,
-    /// The default, as JSON.
     pub default: fn() -> Value,
     pub fits: fn(&Value) -> bool,
     /// Minimum and maximum of a number.
@@ -34,7 +32,6 @@ pub struct Setting {
     pub expected: &'static str,
     /// The placeholder of the value in a program's help; empty for the setting's name.
     pub placeholder: &'static str,
-    /// Lists the built-in names that are values.
     pub names: Option<fn() -> String>,
     /// Whether recorded states decide the setting.
     pub of_states: bool,
@@ -46,7 +43,6 @@ pub struct Setting {
 
 /// A struct of settings, which [`settings!`](crate::settings!) declares.
 pub trait Settings: Default + Serialize + DeserializeOwned {
-    /// Lists the settings in the order of their declarations.
     fn settings() -> Vec<Setting>;
 
     fn values(&self) -> Map<String, Value> {
@@ -57,9 +53,6 @@ pub trait Settings: Default + Serialize + DeserializeOwned {
     }
 
     /// Returns a copy of these settings with the values in `given`.
-    ///
-    /// # Errors
-    /// If a name is unknown or a value is invalid.
     fn replaced(&self, given: &Map<String, Value>) -> Result<Self, SettingError> {
         let (known, mut values) = (Self::settings(), self.values());
         for (name, value) in given {
@@ -119,10 +112,6 @@ impl Setting {
         for_servers: false,
     };
 
-    /// Checks the type and range of a value.
-    ///
-    /// # Errors
-    /// If the type is wrong, or a number is out of range.
     pub fn check(&self, value: &Value) -> Result<(), SettingError> {
         let number = || value.as_number()?.as_i128();
         let in_range = match self.range {
@@ -135,10 +124,6 @@ impl Setting {
         Err(SettingError::new(self.name, self.expected(), value.clone()))
     }
 
-    /// Parses the value of a flag, and checks it.
-    ///
-    /// # Errors
-    /// Says what was expected.
     pub fn parse(&self, text: &str) -> Result<Value, String> {
         let values = [Some(text.into()), serde_json::from_str(text).ok()];
         let mut values = values.into_iter().flatten();
@@ -305,16 +290,13 @@ pub enum Start {
     /// sides, then at the corners again.
     #[default]
     Corner,
-    /// All robots in the middle.
     Centre,
     /// Cells drawn from the world's seed.
     Random,
-    /// All robots in this cell.
     #[serde(untagged)]
     At(#[serde(deserialize_with = "start_cell")] Cell),
 }
 
-/// A cell as a table, or as the text `ROW,COL`.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum StartCell {

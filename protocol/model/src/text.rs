@@ -24,7 +24,6 @@ pub fn read_text(path: &Path) -> std::io::Result<String> {
     decoded(&bytes).map_err(std::io::Error::other)
 }
 
-/// Maximum number of characters of a given value that an error quotes.
 const MAX_QUOTED: usize = 80;
 
 /// Returns a given value for an error: of a value with more than 80 characters, its beginning and its end.

@@ -36,7 +36,6 @@ pub struct Transition {
     planes: Vec<f32>,
     /// The sum of the beliefs at the taps of each group.
     sums: Vec<Lanes>,
-    /// The weight of each next state, before the division of eq. 3.
     weights: Vec<Lanes>,
 }
 

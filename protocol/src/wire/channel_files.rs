@@ -95,7 +95,6 @@ impl ChannelFiles {
         Ok(tags)
     }
 
-    /// Returns the ids of the services in use, from their files.
     pub(super) fn service_ids(&self, used: &Used) -> Result<HashSet<u128>, Error> {
         let mut ids = HashSet::new();
         for path in entries(&self.root.join("services"))? {
@@ -130,7 +129,6 @@ impl ChannelFiles {
         ids.filter_map(|word| word.parse().ok()).collect()
     }
 
-    /// Returns the id of the node to which a folder, or a file next to the folder, belongs.
     pub(super) fn node(&self, path: &Path) -> Option<u128> {
         let name = name(path);
         let monitor = name.strip_prefix(&self.prefix);
@@ -165,7 +163,6 @@ impl ChannelFiles {
     }
 }
 
-/// Returns the ids of living nodes, and the dead nodes.
 pub(super) fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<Ipc>>), Error> {
     let (mut living, mut unclear, mut dead) = (HashSet::new(), Vec::new(), Vec::new());
     let sort = |state| {

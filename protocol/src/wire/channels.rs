@@ -29,10 +29,8 @@ pub use emberwatch_messages::capacity::{
 pub use emberwatch_messages::errors::ChannelError;
 pub use emberwatch_messages::instance::Instance;
 
-/// Maximum number of observers of `frames` at a time.
 pub const MAX_OBSERVERS: usize = 16;
 
-/// Maximum number of readers of `truth` at a time.
 pub const MAX_TRUTH_READERS: usize = 4;
 
 /// Number of frames that an observer may be behind before it loses the oldest.
@@ -42,7 +40,6 @@ pub const FRAME_BUFFER: usize = 64;
 /// be published at once without loss.
 pub const TRUTH_BUFFER: usize = 128;
 
-/// Maximum number of readers of `agent` at a time.
 pub const MAX_AGENT_READERS: usize = 4;
 
 /// Number of beliefs that a reader may be behind before it loses the oldest. A display needs only the newest.
@@ -105,7 +102,6 @@ pub fn service_name(instance: &Instance, channel: Channel) -> ServiceName {
     ServiceName::new(&name).expect("invariant: instance names are short and plain")
 }
 
-/// Returns the error for a channel that does not exist in this protocol version.
 fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
     match other_version(instance.name(), channel.name()) {
         Some(version) => ChannelError::OtherVersion { version },
@@ -113,7 +109,6 @@ fn none_of(instance: &Instance, channel: Channel) -> ChannelError {
     }
 }
 
-/// The services of an instance. The methods open or create each service with its limits.
 pub struct Services<'a> {
     pub node: &'a Node<Ipc>,
     pub instance: &'a Instance,
@@ -130,9 +125,6 @@ impl Services<'_> {
     }
 
     /// Opens or creates the `control` service. Only servers call this.
-    ///
-    /// # Errors
-    /// The same as [`Self::create_step`].
     pub fn create_control(&self) -> Result<ControlService, ChannelError> {
         self.create(Channel::Control)
     }
@@ -152,9 +144,6 @@ impl Services<'_> {
     }
 
     /// Opens or creates the `truth` service. It is for evaluation and display, and learners must never read it.
-    ///
-    /// # Errors
-    /// If iceoryx2 can neither open nor create it.
     pub fn truth(&self) -> Result<TruthService, ChannelError> {
         self.publications(Channel::Truth, 1, MAX_TRUTH_READERS, TRUTH_BUFFER)
             .map_err(ipc_error("open the truth channel"))

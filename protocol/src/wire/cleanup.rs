@@ -43,7 +43,6 @@ use std::time::{Duration, Instant};
 /// Maximum wait until a segment is finished or removed.
 const UNFINISHED: Duration = Duration::from_millis(1500);
 
-/// Interval between two checks of an unfinished segment.
 const INTERVAL: Duration = Duration::from_millis(10);
 
 /// Removes the files of dead processes, and returns the number of removed files and folders.
@@ -157,7 +156,6 @@ impl ChannelFiles {
     }
 }
 
-/// Removes the files and folders for which `is_left` returns true, and returns their number.
 fn remove_if(
     paths: Vec<PathBuf>,
     is_left: impl Fn(&Path) -> Result<bool, Error>,
@@ -183,6 +181,7 @@ mod tests {
     use crate::wire::ipc::Ipc;
     use iceoryx2::node::NodeBuilder;
     use iceoryx2::prelude::{FileName, Path as IpcPath, SemanticString};
+    use std::collections::BTreeSet;
     use std::fs::{Permissions, create_dir, remove_dir_all, set_permissions};
     use std::os::unix::fs::PermissionsExt;
 
@@ -199,30 +198,25 @@ mod tests {
         set_permissions(&path, Permissions::from_mode(mode)).expect("chmod");
     }
 
-    fn all(files: &ChannelFiles) -> Vec<PathBuf> {
-        let nodes = files.root.join("nodes");
-        let folders = [&files.root, &nodes, &files.root.join("services")];
-        let mut all: Vec<PathBuf> = folders
-            .into_iter()
-            .flat_map(|folder| entries(folder).expect("a folder"))
-            .collect();
-        for node in entries(&nodes).expect("a folder") {
-            all.extend(if node.is_dir() {
-                entries(&node).expect("a folder")
-            } else {
-                Vec::new()
-            });
+    fn below(folder: &Path) -> Vec<PathBuf> {
+        let mut all = entries(folder).expect("a folder");
+        for path in all.clone().iter().filter(|path| path.is_dir()) {
+            all.extend(below(path));
         }
-        all.extend(files.segments().expect("a folder"));
-        all.sort();
         all
     }
 
-    fn files_of_test(name: &str) -> ChannelFiles {
+    fn all(files: &ChannelFiles) -> BTreeSet<PathBuf> {
+        let mut all = below(&files.root);
+        all.extend(files.segments().expect("a folder"));
+        all.into_iter().collect()
+    }
+
+    fn files_of_test(name: &str, shared: PathBuf) -> ChannelFiles {
         let name = format!("emberwatch-{name}-{}", std::process::id());
         ChannelFiles {
             root: std::env::temp_dir().join(&name),
-            shared: SHARED_MEMORY.into(),
+            shared,
             prefix: format!("{name}_"),
         }
     }
@@ -230,10 +224,7 @@ mod tests {
     #[test]
     fn the_wait_for_an_unfinished_segment_is_limited() {
         // The temporary folder is used so that leftovers do no harm if this process is killed.
-        let files = ChannelFiles {
-            shared: std::env::temp_dir(),
-            ..files_of_test("unfinished")
-        };
+        let files = files_of_test("unfinished", std::env::temp_dir());
         let young = id(std::process::id(), Duration::ZERO);
         let segment = files
             .shared
@@ -252,10 +243,7 @@ mod tests {
 
     #[test]
     fn files_of_a_dead_process_are_removed_while_its_peer_lives() {
-        let files = ChannelFiles {
-            shared: std::env::temp_dir(),
-            ..files_of_test("half-dead")
-        };
+        let files = files_of_test("half-dead", std::env::temp_dir());
         let minutes = |n: u64| id(std::process::id(), Duration::from_secs(60 * n));
         let (living, other, dead) = (minutes(1), minutes(2), id(NOBODY, Duration::ZERO));
         let used = Used {
@@ -277,7 +265,7 @@ mod tests {
     #[test]
     fn exactly_the_files_of_no_living_process_are_removed() {
         let me = std::process::id();
-        let files = files_of_test("leftovers");
+        let files = files_of_test("leftovers", SHARED_MEMORY.into());
         let (root, prefix) = (&files.root, &files.prefix);
         create_dir(root).expect("a new folder");
         let mut config = node_config().expect("the usual configuration");

@@ -24,7 +24,6 @@ pub use emberwatch_messages::message::worlds_of;
 const FIRST_PAUSE: Duration = Duration::from_millis(5);
 const LONGEST_PAUSE: Duration = Duration::from_millis(200);
 
-/// A connection to a running server.
 pub struct Connection {
     ports: Opened<Ports>,
     info: ServerInfo,
@@ -126,10 +125,6 @@ impl Connection {
         &self.info
     }
 
-    /// Sends a request on the control channel.
-    ///
-    /// # Errors
-    /// If the server refuses, has ended, or sends no valid answer in time.
     pub fn control(
         &mut self,
         request: &Request,

@@ -16,7 +16,6 @@ use std::time::{Duration, Instant};
 
 pub use super::resources::SHARED_MEMORY;
 
-/// Interval between two checks that a program's files still exist.
 const CHECK_INTERVAL: Duration = Duration::from_millis(200);
 
 /// Returns the directory of this user's channel files: `/dev/shm/emberwatch-<uid>/`.
@@ -40,9 +39,6 @@ pub struct Entries {
 
 impl Entries {
     /// Lists the files of a node. Call it after the node's ports have been created.
-    ///
-    /// # Errors
-    /// If the files cannot be listed.
     pub fn of(node: &Node<Ipc>) -> Result<Self, ChannelError> {
         let (directory, id) = (channel_directory(), node.id().value());
         let folder = directory.join(format!("nodes/{id}"));
@@ -65,9 +61,6 @@ impl Entries {
     }
 
     /// Checks as [`Self::check`] does, but does nothing if the last check was shortly before `now`.
-    ///
-    /// # Errors
-    /// If a file was removed.
     pub fn check_at(&self, now: Instant) -> Result<(), ChannelError> {
         if now.saturating_duration_since(self.checked.get()) < CHECK_INTERVAL {
             return Ok(());
@@ -78,9 +71,6 @@ impl Entries {
     }
 
     /// Checks that all files still exist.
-    ///
-    /// # Errors
-    /// If a file was removed.
     pub fn check(&self) -> Result<(), ChannelError> {
         let removed = self
             .paths
@@ -95,7 +85,6 @@ impl Entries {
     }
 }
 
-/// Returns the channel directory. Creates it if it is missing, and checks it.
 pub(crate) fn own_channel_directory() -> Result<PathBuf, ChannelError> {
     let directory = channel_directory();
     own_directory(&directory)?;
@@ -134,7 +123,6 @@ pub(super) fn no_server(instance: &Instance) -> ChannelError {
     }
 }
 
-/// Returns a sentence about the users other than `own` whose shared memory is in a folder.
 fn others(folder: &std::path::Path, own: u32) -> Option<String> {
     let of = |name: &str| -> Option<u32> {
         // Other files stay after a user's last program.

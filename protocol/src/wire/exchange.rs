@@ -23,7 +23,6 @@ use std::time::{Duration, Instant};
 /// Maximum time between two checks for the answer, which limits the cost of a lost wake-up.
 const LONGEST_SLEEP: Duration = Duration::from_millis(50);
 
-/// Maximum time for the answering side to release an abandoned request.
 const RELEASE_TIMEOUT: Duration = Duration::from_millis(500);
 
 pub(super) type RequestClient<Q, R> = Client<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
@@ -103,7 +102,6 @@ impl Exchange {
         Ok([readable[0], readable[1]])
     }
 
-    /// Returns the error for a server that has ended, and removes the files of the dead server.
     pub(super) fn server_gone(&self) -> ConnectionError {
         let _ = remove_leftovers(); // If this fails, the next program removes them.
         ConnectionError::ServerGone {

@@ -14,7 +14,6 @@ const INTERVAL: Duration = Duration::from_millis(20);
 /// receive it, because the process has ended.
 const FAREWELL: Duration = Duration::from_millis(500);
 
-/// The beliefs that the agents of one process publish.
 pub struct Feed {
     publisher: Option<BeliefPublisher>,
     turns: Turns,
@@ -29,10 +28,9 @@ struct Turns {
 /// One world's belief, the posterior after the frame of `result`.
 pub struct View<'a> {
     pub world: u32,
-    /// Numbers of the robots that the agent flies in it.
     pub robots: Range<u32>,
     pub result: &'a WorldResult,
-    /// The belief, shape `[S, H, W]`.
+    /// Shape `[S, H, W]`.
     pub belief: &'a Probabilities,
     /// The policy and estimator, and the objective of the path.
     pub intent: Intent,
@@ -120,7 +118,6 @@ impl Turns {
         turn.map(|number| number % n_worlds).collect()
     }
 
-    /// Records that a world's belief was published.
     fn pass(&mut self, now: Instant) {
         self.shown = Some(now);
         self.n_shown += 1;

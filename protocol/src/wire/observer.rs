@@ -60,17 +60,12 @@ impl Gaps {
 struct Polling {
     buffer: usize,
     is_eager: bool,
-    /// Samples since the last sleep.
     n_found: Cell<usize>,
-    /// The time at which the observer was last found busy.
     busy: Cell<Instant>,
 }
 
 impl Observer<FrameHeader> {
     /// Opens the frames of an instance. The server then immediately publishes the current frame of every world.
-    ///
-    /// # Errors
-    /// If the channel cannot be opened, or has too many observers.
     pub fn frames(instance: &Instance) -> Result<Self, ChannelError> {
         let frames = |services: &Services<'_>| services.frames();
         Self::new(instance, frames, FRAME_BUFFER, "16 observers", true)
@@ -79,9 +74,6 @@ impl Observer<FrameHeader> {
 
 impl Observer<TruthHeader> {
     /// Opens the hidden states of an instance. They arrive only if the instance's server publishes them.
-    ///
-    /// # Errors
-    /// If the channel cannot be opened, or has too many readers.
     pub fn truth(instance: &Instance) -> Result<Self, ChannelError> {
         let truth = |services: &Services<'_>| services.truth();
         Self::new(
@@ -96,9 +88,6 @@ impl Observer<TruthHeader> {
 
 impl Observer<AgentHeader> {
     /// Opens the beliefs of an instance's agents. [`super::agent_belief::AgentBelief`] checks each sample.
-    ///
-    /// # Errors
-    /// If the channel cannot be opened, or has too many readers.
     pub fn agents(instance: &Instance) -> Result<Self, ChannelError> {
         let agent = |services: &Services<'_>| services.agent();
         Self::new(instance, agent, AGENT_BUFFER, "4 readers of beliefs", false)
@@ -152,9 +141,6 @@ impl<H: Published> Observer<H> {
 
     /// Waits for the next sample. Returns `None` if no sample arrived in time. A gap in the headers' sequence numbers
     /// means that this observer was too slow and lost samples.
-    ///
-    /// # Errors
-    /// If iceoryx2 cannot read the channel, or its files were removed.
     pub fn receive(&self, timeout: Duration) -> Result<Option<Sample<H>>, ChannelError> {
         let start = Instant::now();
         loop {
@@ -230,7 +216,6 @@ impl<H: Published> Observer<H> {
 }
 
 impl Polling {
-    /// Returns the time to sleep after the buffer was emptied.
     fn interval(&self, now: Instant) -> Duration {
         if self.n_found.replace(0) > self.buffer / 4 {
             self.busy.set(now);

@@ -31,9 +31,6 @@ impl WatchedProcess {
     }
 
     /// Watches the process that `--exit-with` names.
-    ///
-    /// # Errors
-    /// If the process does not run, or the system does not allow watching it.
     pub fn watch(pid: i32) -> Result<Self, NotWatched> {
         Self::open(pid).map_err(|errno| match errno {
             Errno::SRCH | Errno::INVAL => NotWatched::NotRunning { pid },
@@ -45,9 +42,6 @@ impl WatchedProcess {
     }
 
     /// Checks that this process may watch others. Otherwise it could not notice their deaths.
-    ///
-    /// # Errors
-    /// If the system does not allow it.
     pub fn check() -> Result<(), ChannelError> {
         Self::open(getpid().as_raw_nonzero().get())
             .map(drop)
@@ -63,7 +57,6 @@ impl WatchedProcess {
     }
 }
 
-/// Returns the error for a process that cannot be watched, though it may run.
 pub(super) fn watch_error(errno: Errno) -> ChannelError {
     call_error("pidfd_open", errno)
 }

@@ -14,7 +14,6 @@ use std::os::unix::net::UnixDatagram;
 /// The folder of iceoryx2's shared memory, which every user may write to.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 
-/// Advice if the folder is full.
 pub(super) const REMEDY: &str = "free some, or give the container more (docker: --shm-size)";
 
 /// Shared memory in bytes that the ports of a client or an observer need, in addition to the memory for their longest
@@ -37,9 +36,6 @@ pub(super) const SERVER_DESCRIPTORS: usize = 10;
 const FEW_DESCRIPTORS: usize = 10;
 
 /// Checks that there is enough shared memory for the ports of a connection, and for a message on them.
-///
-/// # Errors
-/// If less is available.
 pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelError> {
     let n_bytes = PORT_BYTES + message_bytes as u64;
     check_room(n_bytes, n_bytes)
@@ -47,9 +43,6 @@ pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelEr
 
 /// Checks that `n_bytes` bytes of shared memory and enough files for the ports of a connection are free, and that a
 /// file may have `longest_file` bytes.
-///
-/// # Errors
-/// If less is available.
 pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
     let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
     if limit < longest_file {
@@ -71,10 +64,6 @@ pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
     })
 }
 
-/// Checks that `n_bytes` bytes of shared memory are free.
-///
-/// # Errors
-/// If less is available.
 pub(super) fn check_free(n_bytes: u64) -> Result<(), ChannelError> {
     let Ok(found) = statvfs(SHARED_MEMORY) else {
         return Ok(());
@@ -151,9 +140,6 @@ pub(super) fn no_descriptors(what: &'static str, needed: usize) -> ChannelError 
 }
 
 /// Checks that `n` descriptors are free, by opening and closing them.
-///
-/// # Errors
-/// The system's error, if fewer are free.
 pub(super) fn free_descriptors(n: usize) -> Result<(), Errno> {
     let opened = (0..n).map(|_| eventfd(0, EventfdFlags::CLOEXEC));
     match opened.collect::<Result<Vec<OwnedFd>, Errno>>() {

@@ -30,10 +30,8 @@ const STOPPED_WAIT: Duration = Duration::from_millis(50);
 /// Time after which a process that has the turn counts as frozen. The system does not report frozen processes.
 const FROZEN_WAIT: Duration = Duration::from_secs(2);
 
-/// Interval between two attempts.
 const INTERVAL: Duration = Duration::from_micros(500);
 
-/// The lock file in the channel directory.
 const LOCK: &str = "lock";
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -85,7 +83,6 @@ impl Turn {
         Self::take_within(LONGEST_WAIT)
     }
 
-    /// Waits as [`Self::take`] does, but at most `limit`.
     pub(crate) fn take_within(limit: Duration) -> Result<Self, ChannelError> {
         Self::take_unless(limit, check_interrupt)
     }
@@ -204,7 +201,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_wait_for_a_turn_times_out_and_names_the_holder() {
+    fn a_wait_for_a_turn_is_interrupted_or_times_out_and_names_the_holder() {
         let path = std::env::temp_dir().join(format!("emberwatch-turn-{}", std::process::id()));
         let first = wait(&path, Duration::ZERO, || Ok(())).expect("nobody has it");
         let refusal = wait(&path, Duration::from_millis(1), || Ok(())).expect_err("it is taken");
@@ -214,6 +211,8 @@ mod tests {
             matches!(refusal, ChannelError::Locked { .. }),
             "agents wait on"
         );
+        let refusal = wait(&path, LONGEST_WAIT, || Err(ChannelError::Interrupted));
+        assert!(matches!(refusal, Err(ChannelError::Interrupted)));
         std::fs::remove_file(&path).expect("remove it");
         let second = wait(&path, Duration::ZERO, || Ok(())).expect("another file of that name");
         assert!(first.is_some() && second.is_some());
@@ -236,16 +235,6 @@ mod tests {
         let next = wait(&path, Duration::from_secs(5), || Ok(())).expect("it is free");
         assert!(next.is_some());
         drop(copy);
-    }
-
-    #[test]
-    fn a_wait_for_a_turn_is_interrupted() {
-        let path = std::env::temp_dir().join(format!("emberwatch-wait-{}", std::process::id()));
-        let held = wait(&path, Duration::ZERO, || Ok(())).expect("nobody has it");
-        let refusal = wait(&path, LONGEST_WAIT, || Err(ChannelError::Interrupted));
-        assert!(matches!(refusal, Err(ChannelError::Interrupted)));
-        drop(held);
-        std::fs::remove_file(&path).expect("clean up");
     }
 
     #[test]

@@ -12,7 +12,6 @@ use std::time::{Duration, Instant};
 
 pub use super::poll::{is_readable, sleep_until_event, sleep_until_readable};
 
-/// A waiter that learns whether spinning pays.
 #[derive(Debug, Default)]
 pub struct Waiter {
     spinning: Cell<Spinning>,
@@ -23,9 +22,6 @@ impl Waiter {
     ///
     /// `block` must not sleep longer than the duration passed to it. It is called repeatedly until the timeout, so it
     /// may return early for any reason.
-    ///
-    /// # Errors
-    /// The first error of `poll` or `block`.
     pub fn wait<T, E>(
         &self,
         timeout: Duration,
@@ -64,9 +60,6 @@ pub fn descriptor(listener: &Listener<Ipc>) -> BorrowedFd<'_> {
 }
 
 /// Drops a listener's wake-ups, and returns whether there were any.
-///
-/// # Errors
-/// If iceoryx2 cannot read them.
 pub fn drain(listener: &Listener<Ipc>) -> Result<bool, ChannelError> {
     let drained = listener.try_wait(|_| {});
     drained

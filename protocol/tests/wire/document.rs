@@ -73,36 +73,17 @@ pub fn fences(language: &str) -> Vec<(&'static str, &'static str)> {
         .collect()
 }
 
-/// Returns the byte sizes in a Python `struct` format with `=`.
-pub fn sizes_of_struct_format(format: &str) -> Vec<usize> {
-    let codes = format.strip_prefix('=').expect("standard sizes");
-    let mut count = None;
-    let mut sizes = Vec::new();
-    for code in codes.chars() {
-        let size = match code {
-            'H' => 2,
-            'I' => 4,
-            'Q' | 'd' => 8,
-            digit => {
-                count = Some(digit.to_digit(10).expect("a known code") as usize);
-                continue;
-            }
-        };
-        sizes.extend(vec![size; count.take().unwrap_or(1)]);
-    }
-    sizes
-}
-
-/// Returns the sizes of a struct's scalars, with nested structs flattened.
-pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
-    let of_field = |field: &Field| match field.of.as_str() {
-        "u16" => vec![2],
-        "u32" => vec![4],
-        "u64" | "f64" => vec![8],
-        "WorldResult" => scalar_sizes(&documented_struct("WorldResult").0),
+/// Returns the codes of fields in Python's `struct`.
+pub fn struct_codes(fields: &[Field]) -> String {
+    let code = |field: &Field| match field.of.as_str() {
+        "u16" => "H".into(),
+        "u32" => "I".into(),
+        "u64" => "Q".into(),
+        "f64" => "d".into(),
+        "WorldResult" => struct_codes(&documented_struct("WorldResult").0.fields),
         other => panic!("{other}: unknown type"),
     };
-    layout.fields.iter().flat_map(of_field).collect()
+    fields.iter().map(code).collect()
 }
 
 /// Returns the bytes of a worked example. Checks the names of its fields, and that each value matches its bytes.

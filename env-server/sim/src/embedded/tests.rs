@@ -1,41 +1,24 @@
 use super::*;
-use crate::config::ServerConfig;
+use crate::simulator::tests::lab::settings;
 use emberwatch_messages::client::{Claim, Client, Observation};
-use emberwatch_messages::control::{CoverageRule, Request, WorldInfo, WorldSeed};
+use emberwatch_messages::control::{Request, WorldInfo, WorldSeed};
 use emberwatch_model::path::Move;
-use emberwatch_model::settings::WorldSettings;
 use emberwatch_model::{Coverage, UNOBSERVED};
 use serde_json::{Value, json};
+use std::collections::BTreeSet;
 use std::fmt::Debug;
 
 const LONG: Duration = Duration::from_secs(60);
 
-fn client(n_worlds: u32, burn_in: u64) -> Client<Embedded> {
-    client_of(ServerConfig {
-        worlds: n_worlds,
-        world: WorldSettings {
-            burn_in,
-            ..small_worlds()
-        },
-        ..ServerConfig::default()
-    })
-}
-
-fn small_worlds() -> WorldSettings {
-    WorldSettings {
-        height: 7,
-        width: 5,
-        moves: 4,
-        burn_in: 20,
-        model: "wildfire-small".into(),
-        ..WorldSettings::default()
-    }
-}
-
-/// Creates worlds, and a client that holds a robot in each.
-fn client_of(config: ServerConfig) -> Client<Embedded> {
-    let n_worlds = config.worlds;
-    let worlds = Embedded::new(config.check().expect("settings")).expect("worlds");
+/// Creates small worlds with these settings, and a client that holds a robot in each.
+fn client(given: Value) -> Client<Embedded> {
+    let mut all = json!({"height": 7, "width": 5, "moves": 4, "burn_in": 20});
+    all["model"] = "wildfire-small".into();
+    let given = given.as_object().expect("a dictionary").clone();
+    all.as_object_mut().expect("a dictionary").extend(given);
+    let checked = settings(all);
+    let n_worlds = checked.config.worlds;
+    let worlds = Embedded::new(checked).expect("worlds");
     Client::acquire(worlds, &Claim::new(0..n_worlds)).expect("a lease")
 }
 
@@ -43,6 +26,11 @@ fn step(client: &mut Client<Embedded>) -> Result<Vec<Observation>, ConnectionErr
     let path = vec![Move::Down, Move::Right, Move::Down, Move::Right];
     let paths = vec![path; client.robots().len()];
     client.step(client.robots(), &paths)
+}
+
+fn ask(client: &mut Client<Embedded>, request: Value) {
+    let request: Request = serde_json::from_value(request).expect("a request");
+    client.backend().control(&request, LONG).expect("done");
 }
 
 fn reset(world: u32, seed: u64) -> [WorldSeed; 1] {
@@ -59,7 +47,7 @@ fn status<T: Debug>(refused: Result<T, ConnectionError>) -> Status {
 
 #[test]
 fn a_client_flies_resets_and_recalls() {
-    let mut client = client(2, 20);
+    let mut client = client(json!({"worlds": 2}));
     let first = step(&mut client).expect("a step");
     let second = step(&mut client).expect("a step");
     assert_eq!(second.len(), 2);
@@ -80,20 +68,10 @@ fn a_client_flies_resets_and_recalls() {
 #[test]
 fn a_world_does_not_depend_on_worlds_next_to_it_or_on_threads() {
     let start = |worlds, threads, seed| {
-        let world = WorldSettings {
-            height: 72,
-            width: 72,
-            burn_in: 3,
-            ..small_worlds()
-        };
-        client_of(ServerConfig {
-            worlds,
-            threads,
-            seed,
-            coverage: CoverageRule::Full,
-            world,
-            ..ServerConfig::default()
-        })
+        client(json!({
+            "worlds": worlds, "threads": threads, "seed": seed, "coverage": "full",
+            "height": 72, "width": 72, "burn_in": 3,
+        }))
     };
     // A batch so large that both threads step it.
     let mut together = start(8, 2, 0);
@@ -111,7 +89,7 @@ fn a_world_does_not_depend_on_worlds_next_to_it_or_on_threads() {
 
 #[test]
 fn a_reset_begins_an_episode_with_an_empty_frame_and_a_seed() {
-    let mut client = client(3, 20);
+    let mut client = client(json!({"worlds": 3}));
     step(&mut client).expect("a step");
     let seeds = [(2, 0), (0, u64::MAX)];
     let begun = client.reset(&seeds.map(|(world, seed)| reset(world, seed)[0]));
@@ -128,29 +106,19 @@ fn a_reset_begins_an_episode_with_an_empty_frame_and_a_seed() {
     assert_eq!(seen.robot.coverage, Coverage::Empty as u32);
     assert_eq!((seen.world.reward, seen.world.n_visited), (0.0, 0));
     // Without a given seed, each reset chooses a new one.
-    let mut seeds = Vec::from_iter((0..4).map(|_| {
-        let world = WorldSeed {
-            world: 0,
-            seed: None,
-        };
-        client.reset(&[world]).expect("a world")[0].seed
-    }));
-    seeds.sort_unstable();
-    seeds.dedup();
+    let (world, seed) = (0, None);
+    let mut next = || client.reset(&[WorldSeed { world, seed }]).expect("a world")[0].seed;
+    let seeds = BTreeSet::from_iter((0..4).map(|_| next()));
     assert_eq!(seeds.len(), 4, "{seeds:?}");
-    assert!(seeds[0] > 0 && seeds[3] < 1 << 53, "{seeds:?}");
+    assert!(
+        seeds.iter().all(|seed| (1..1 << 53).contains(seed)),
+        "{seeds:?}"
+    );
 }
 
 #[test]
 fn an_episode_is_over_at_max_steps_until_it_is_reset() {
-    let mut client = client_of(ServerConfig {
-        worlds: 2,
-        world: WorldSettings {
-            max_steps: 2,
-            ..small_worlds()
-        },
-        ..ServerConfig::default()
-    });
+    let mut client = client(json!({"worlds": 2, "max_steps": 2}));
     for is_truncated in [0, 1] {
         let seen = step(&mut client).expect("a step");
         assert!(seen.iter().all(|it| it.world.truncated == is_truncated));
@@ -165,25 +133,17 @@ fn an_episode_is_over_at_max_steps_until_it_is_reset() {
 
 #[test]
 fn a_restored_snapshot_continues_in_the_same_way() {
-    let mut client = client(2, 20);
+    let mut client = client(json!({"worlds": 2}));
     step(&mut client).expect("a step");
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("worlds").display().to_string();
-    let request = |text: Value| serde_json::from_value::<Request>(text).expect("a request");
-    let save = json!({"op": "snapshot", "first_world": 0, "n_worlds": 2, "path": path});
-    client
-        .backend()
-        .control(&request(save), LONG)
-        .expect("a file");
+    let mut of_file = json!({"op": "snapshot", "first_world": 0, "n_worlds": 2, "path": path});
+    ask(&mut client, of_file.clone());
     let present = client.observe(0..2).expect("worlds");
     let past = client.recall(0..2, 0).expect("kept");
     let future = step(&mut client).expect("a step");
-    let lease = client.lease();
-    let load = request(
-        json!({"op": "restore", "lease": lease, "first_world": 0, "n_worlds": 2,
-        "from": 0, "path": path}),
-    );
-    client.backend().control(&load, LONG).expect("worlds");
+    (of_file["op"], of_file["lease"]) = ("restore".into(), client.lease().into());
+    ask(&mut client, of_file);
     assert_eq!(client.observe(0..2).expect("worlds"), present);
     assert_eq!(client.recall(0..2, 0).expect("kept"), past);
     assert_eq!(step(&mut client).expect("a step"), future);
@@ -191,7 +151,7 @@ fn a_restored_snapshot_continues_in_the_same_way() {
 
 #[test]
 fn requests_are_refused_as_a_server_refuses_them() {
-    let mut client = client(2, 20);
+    let mut client = client(json!({"worlds": 2}));
     let lease = client.lease();
     assert_eq!(status(client.reset(&reset(3, 1))), Status::NoSuchWorld);
     // The sum of the lengths is right.
@@ -199,18 +159,16 @@ fn requests_are_refused_as_a_server_refuses_them() {
     assert_eq!(status(uneven), Status::WrongPathLength);
     let few = client.step(0..2, &[vec![Move::Up; 4]]);
     assert_eq!(status(few), Status::WrongLength);
-    let release = Request::Release { lease };
-    client.backend().control(&release, LONG).expect("a lease");
+    ask(&mut client, json!({"op": "release", "lease": lease}));
     assert_eq!(status(step(&mut client)), Status::LeaseLost);
-    let shutdown = client.backend().control(&Request::Shutdown {}, LONG);
-    shutdown.expect("an end");
+    ask(&mut client, json!({"op": "shutdown"}));
     let gone = step(&mut client);
     assert!(matches!(gone, Err(ConnectionError::ServerGone { .. })));
 }
 
 #[test]
 fn an_interrupted_wait_leaves_its_worlds_to_the_next_call() {
-    let mut client = client(1, 100_000);
+    let mut client = client(json!({"burn_in": 100_000}));
     let reset = Request::Reset {
         lease: client.lease(),
         worlds: reset(0, 5).into(),
@@ -224,16 +182,9 @@ fn an_interrupted_wait_leaves_its_worlds_to_the_next_call() {
 
 #[test]
 fn worlds_that_do_not_fit_in_memory_are_refused() {
-    let config = ServerConfig {
-        worlds: 1024,
-        world: WorldSettings {
-            height: 4096,
-            width: 4096,
-            ..WorldSettings::default()
-        },
-        ..ServerConfig::default()
-    };
-    let refused = Embedded::new(config.check().expect("settings"));
+    let refused = Embedded::new(settings(
+        json!({"worlds": 1024, "height": 4096, "width": 4096}),
+    ));
     let refused = refused.map(|_| ()).expect_err("too much").to_string();
     let expected = "for 1024 worlds of 4096 x 4096 cells, got ";
     assert!(refused.starts_with("memory: expected "), "{refused}");

@@ -22,7 +22,6 @@ impl Simulator {
         deadlines.min()
     }
 
-    /// Withdraws a step request whose client has stopped waiting for the answer.
     pub fn cancel_step(&mut self, now: Instant, ticket: Ticket) {
         for &world in &self.waiting_worlds {
             let barrier = &mut self.places[world].barrier;
@@ -82,7 +81,6 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Refuses all requests that wait for a world that is about to be reset or replaced.
     pub(super) fn refuse_waiting(&mut self, now: Instant, world: usize) {
         for waiter in self.places[world].barrier.withdraw(|_| true) {
             let refusal = Refusal::new(Status::Resetting, world as u64);

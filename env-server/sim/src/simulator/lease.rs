@@ -61,7 +61,6 @@ pub struct Claim {
     pub client: ClientId,
     pub robots: Range<usize>,
     pub takeover: bool,
-    /// Time after its last use at which the lease expires.
     pub time_to_live: Duration,
 }
 
@@ -87,9 +86,6 @@ impl Leases {
     }
 
     /// Grants a lease under a new token. Robots that the client already holds move to the new lease.
-    ///
-    /// # Errors
-    /// If a robot does not exist, or another client holds one and the claim is not a takeover.
     pub fn acquire(&mut self, now: Instant, claim: Claim, token: u64) -> Result<&Lease, Refusal> {
         self.check_robots(&claim.robots)?;
         self.expire(now);
@@ -202,7 +198,6 @@ impl Leases {
         self.end_where(|lease| lease.client.pid == pid)
     }
 
-    /// Ends and returns the leases whose client's node is not in `nodes`.
     pub fn end_of_nodes_except(&mut self, nodes: &HashSet<u128>) -> Vec<Lease> {
         self.end_where(|lease| !nodes.contains(&lease.client.node))
     }
@@ -225,7 +220,6 @@ impl Leases {
         bits(holders.map(Option::is_some))
     }
 
-    /// Returns a mask of the robots that a lease holds, in a range of at most 64.
     pub fn held_under(&self, token: u64, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
         bits(holders.map(|holder| *holder == Some(token)))

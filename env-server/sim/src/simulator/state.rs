@@ -14,7 +14,6 @@ use std::collections::{HashSet, VecDeque};
 use std::ops::Range;
 use std::time::Instant;
 
-/// All worlds and leases of a server. It answers requests without I/O and without a clock.
 pub struct Simulator {
     pub(super) checked: Checked,
     pub(super) spec: WorldSpec,
@@ -101,7 +100,6 @@ impl Simulator {
         self.beliefs.forget(self.robots_of(world));
     }
 
-    /// Returns the specification of the worlds, which worlds read from snapshots must fit.
     pub fn spec(&self) -> &WorldSpec {
         &self.spec
     }
@@ -202,7 +200,6 @@ pub(super) fn within(robots: &Range<usize>, of_world: Range<usize>) -> Range<usi
     robots.start.max(first) - first..robots.end.min(end) - first
 }
 
-/// Returns `[row, col]` of each robot.
 pub(super) fn cells(episode: &Episode) -> Vec<[u32; 2]> {
     let robots = episode.robots().iter();
     let cells = robots.map(Robot::cell);

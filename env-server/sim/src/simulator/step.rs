@@ -136,7 +136,6 @@ impl Simulator {
         Some(self.wait(now, client, request, worlds.start))
     }
 
-    /// Makes a request wait until the other paths for its world's next step have arrived.
     fn wait(
         &mut self,
         now: Instant,

@@ -48,7 +48,6 @@ pub struct NewEpisode {
     pub episode: u64,
 }
 
-/// A world with its fields in the order in which they are encoded.
 #[derive(Encode)]
 struct EncodedWorld<'a> {
     result: Vec<u8>,

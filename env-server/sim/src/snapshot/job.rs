@@ -15,7 +15,6 @@ pub enum Job {
         path: PathBuf,
         bytes: Vec<u8>,
     },
-    /// Writes the server's next automatic snapshot.
     Autosave {
         folder: Folder,
         durability: Durability,

@@ -20,7 +20,6 @@ const TASK: &str = "task";
 /// another trajectory or other rewards.
 const WORLDS: u32 = 1;
 
-/// The settings of a server on which its worlds depend.
 #[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
 pub struct Settings {
     /// The model file as TOML, without its maps.

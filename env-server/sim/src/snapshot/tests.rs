@@ -2,12 +2,10 @@
 
 use super::format::{HEADER_BYTES, NewEpisode, SnapshotWorld, decode, encode};
 use super::settings::{Settings, WorldSpec};
-use crate::config::ServerConfig;
+use crate::simulator::tests::lab::settings;
 use crate::world::{Episode, Flown, Rules, SavedWorld};
-use emberwatch_messages::control::CoverageRule;
-use emberwatch_model::settings::Start;
-use emberwatch_model::settings::WorldSettings;
 use emberwatch_model::{Airspace, Cell, Grid, Move};
+use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -17,20 +15,9 @@ const NEW: NewEpisode = NewEpisode {
 };
 
 fn spec() -> WorldSpec {
-    let config = ServerConfig {
-        history: 4,
-        world: WorldSettings {
-            height: 3,
-            width: 5,
-            moves: 2,
-            robots: 2,
-            burn_in: 300,
-            ..WorldSettings::default()
-        },
-        ..ServerConfig::default()
-    };
-    let checked = config.check().expect("valid settings");
-    WorldSpec::of(&checked).expect("a valid model")
+    let given =
+        json!({"history": 4, "height": 3, "width": 5, "moves": 2, "robots": 2, "burn_in": 300});
+    WorldSpec::of(&settings(given)).expect("a valid model")
 }
 
 fn episodes(rules: &Rules) -> Vec<Episode> {
@@ -48,8 +35,7 @@ fn step(rules: &Rules, episode: &mut Episode, full: u64) {
         moves: &[Move::Right, Move::Down, Move::Left, Move::Up],
         ready: 0b11,
         full,
-        hovered: 0,
-        late: 0,
+        ..Flown::default()
     };
     episode.step(rules, &flown);
 }
@@ -132,7 +118,6 @@ const MISFITS: &[(Change, &str)] = changes! { world:
     { world.robots[0].outcome.marginal = f64::INFINITY; } "reward: expected a finite number, got inf"
     { world.robots.pop(); } "robots: expected 2, got 1"
     { world.outcome.late = 4; } "robots that stayed: expected bits below 2, got 4"
-    { world.outcome.hovered = 8; } "robots that stayed: expected bits below 2, got 8"
     { world.outcome.step = u64::MAX; } "step: expected at most"
     { world.outcome.episode = u64::MAX; } "episode: expected at most"
     { world.outcome.reward = f64::NAN; } "reward: expected a finite number, got NaN"
@@ -176,43 +161,32 @@ fn an_impossible_world_is_refused() {
 
 #[test]
 fn a_fingerprint_differs_exactly_where_the_worlds_differ() {
-    type Change = fn(&mut ServerConfig);
-    let fingerprint = |change: Change| {
-        let mut config = ServerConfig {
-            world: WorldSettings {
-                model: "wildfire-small".into(),
-                height: 8,
-                width: 8,
-                ..WorldSettings::default()
-            },
-            ..ServerConfig::default()
-        };
-        change(&mut config);
-        let checked = config.check().expect("valid settings");
-        Settings::of(&checked).worlds_fingerprint()
+    let fingerprint = |(name, value): (&str, Value)| {
+        let mut given = json!({"model": "wildfire-small", "height": 8, "width": 8});
+        given[name] = value;
+        Settings::of(&settings(given)).worlds_fingerprint()
     };
-    let usual = fingerprint(|_| ());
+    let usual = fingerprint(("height", json!(8)));
     assert_eq!(usual.len(), 16);
-    let same: [Change; 5] = [
-        |config| config.world.max_steps = 7,
-        |config| config.worlds = 3,
-        |config| config.seed = 9,
-        |config| config.publish_truth = true,
-        |config| config.coverage = CoverageRule::Client,
-    ];
-    for (index, change) in same.into_iter().enumerate() {
-        assert_eq!(fingerprint(change), usual, "{index}");
+    for same in [
+        ("max_steps", json!(7)),
+        ("worlds", json!(3)),
+        ("seed", json!(9)),
+        ("publish_truth", json!(true)),
+        ("coverage", json!("client")),
+    ] {
+        assert_eq!(fingerprint(same.clone()), usual, "{same:?}");
     }
-    let other: [Change; 9] = [
-        |config| config.world.height = 9,
-        |config| config.world.width = 9,
-        |config| config.world.moves = 5,
-        |config| config.world.robots = 2,
-        |config| config.world.burn_in = 11,
-        |config| config.world.start = Start::Random,
-        |config| config.world.model = "wildfire".into(),
-        |config| config.world.sensor_radius = 1,
-        |config| config.coverage = CoverageRule::Full,
+    let other = [
+        ("height", json!(9)),
+        ("width", json!(9)),
+        ("moves", json!(5)),
+        ("robots", json!(2)),
+        ("burn_in", json!(11)),
+        ("start", json!("random")),
+        ("model", json!("wildfire")),
+        ("sensor_radius", json!(1)),
+        ("coverage", json!("full")),
     ];
     let mut all: BTreeSet<String> = other.into_iter().map(fingerprint).collect();
     all.insert(usual);

@@ -246,20 +246,17 @@ mod tests {
             moves: &path(moves),
             ready: 1,
             full,
-            hovered: 0,
-            late: 0,
+            ..Flown::default()
         };
         episode.step(rules, &flown);
     }
 
     #[test]
-    fn reward_counts_distinct_burning_cells_after_the_transition() {
-        check_rewards(&rules(0, Start::Centre));
-    }
-
-    #[test]
-    fn a_wide_sensor_sees_around_the_path_but_only_visited_cells_pay() {
-        check_rewards(&rules(2, Start::Centre));
+    fn reward_counts_distinct_visited_cells_on_fire_after_the_transition() {
+        // A wide sensor sees around the path, but only visited cells pay.
+        for radius in [0, 2] {
+            check_rewards(&rules(radius, Start::Centre));
+        }
     }
 
     fn check_rewards(rules: &Rules) {

@@ -3,7 +3,7 @@
 use emberwatch_model::{Coverage, Move};
 
 /// The paths that the robots of a world fly in a step. In each mask, bit r stands for robot r of the world.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Flown<'a> {
     /// One path per robot of the world, in order and of equal length. Only paths of robots in `ready` are flown.
     pub moves: &'a [Move],

@@ -25,7 +25,6 @@ pub struct World {
 }
 
 impl Source {
-    /// Returns the last step of the episode with this seed, or `None` if the source does not limit its length.
     pub(super) fn last_step(&self, seed: u64) -> Option<u64> {
         match self {
             Self::Simulated(_) => None,

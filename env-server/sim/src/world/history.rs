@@ -41,8 +41,7 @@ pub struct PastRobot {
 }
 
 impl History {
-    /// Creates a history for `n_steps` steps, at least one. In each step, each of `n_robots` robots observes up to
-    /// `most_seen` cells.
+    /// Keeps at least one step.
     pub fn new(n_steps: usize, n_robots: usize, most_seen: usize) -> Self {
         let n_steps = n_steps.max(1);
         Self {

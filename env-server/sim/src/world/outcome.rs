@@ -2,7 +2,6 @@
 
 use emberwatch_model::{Cell, Coverage};
 
-/// The result of a step or a reset for a world, including the sums over its robots.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct WorldOutcome {
     /// Step index k after the step; 0 after a reset.
@@ -19,21 +18,18 @@ pub struct WorldOutcome {
     pub late: u64,
     /// Number of cells in the whole grid whose state has the highest reward.
     pub n_target_cells: u32,
-    /// Number of distinct cells that the robots visited.
     pub n_visited: u32,
     pub n_hits: u32,
     pub is_terminated: bool,
     pub is_truncated: bool,
 }
 
-/// The result of a step for a robot, or its position after a reset.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RobotOutcome {
     /// The robot's share of the world's reward: each of v robots that visited a cell gets 1/v of the cell's reward.
     pub reward: f64,
     /// Marginal reward: how much smaller the world's reward would be if this robot had not flown.
     pub marginal: f64,
-    /// Number of distinct cells that the robot visited.
     pub n_visited: u32,
     /// Number of the robot's distinct rewarded cells whose state has the highest reward.
     pub n_hits: u32,

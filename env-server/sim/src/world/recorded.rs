@@ -62,7 +62,6 @@ impl Recorded {
         self.shortest() - 1 - self.most_offset
     }
 
-    /// Returns the last step of the episode with this seed.
     pub(super) fn last_step(&self, seed: u64) -> u64 {
         let Choice {
             sequence, offset, ..
@@ -77,7 +76,6 @@ impl Recorded {
         states
     }
 
-    /// Writes [`Self::states`] into an existing grid.
     pub(super) fn show(&self, seed: u64, step: u64, states: &mut Grid<u8>) {
         let choice = self.choice(seed);
         let recorded = self.sequences[choice.sequence].view();

@@ -19,12 +19,11 @@ pub struct Rules {
     pub airspace: Airspace,
     /// Row-major indices of the cells from which random starts are drawn, or `None` for all cells.
     starts: Option<Arc<Vec<usize>>>,
-    /// Reward of a distinct visited (or seen) cell, indexed by the cell's state.
+    /// Reward of a distinct visited cell, indexed by the cell's state.
     pub reward: Vec<f64>,
     pub target_state: u8,
     pub n_states: usize,
     pub n_observations: usize,
-    /// Number of steps simulated before k = 0.
     pub burn_in: u64,
     /// Episode length in steps. If it is 0, episodes are never truncated.
     pub max_steps: u64,
@@ -74,7 +73,6 @@ impl Rules {
         self
     }
 
-    /// Returns whether the episode with this seed is truncated at a step.
     pub(super) fn truncates(&self, seed: u64, step: u64) -> bool {
         let last = self.source.last_step(seed);
         (self.max_steps > 0 && step >= self.max_steps) || last.is_some_and(|last| step >= last)
@@ -91,7 +89,6 @@ impl Rules {
         })
     }
 
-    /// Returns the maximum number of cells that a robot sees in a step.
     pub(super) fn most_seen(&self) -> usize {
         most_seen(self.airspace.radius(), self.n_moves, self.shape.n_cells())
     }

@@ -20,7 +20,6 @@ pub struct SavedWorld {
     /// Hidden states at k = 0, row-major.
     pub first_states: Vec<u8>,
     pub robots: Vec<SavedRobot>,
-    /// The kept steps, from the oldest to the current one.
     pub history: Vec<PastStep>,
 }
 

@@ -43,7 +43,6 @@ impl Sensor {
         }
     }
 
-    /// Returns the key that generates all readings in one step of a world.
     pub fn key(seed: u64, absolute_step: u64) -> u64 {
         stream(seed, Purpose::Sensor, absolute_step).next_u64()
     }

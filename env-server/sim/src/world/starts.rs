@@ -138,18 +138,18 @@ mod tests {
     use emberwatch_model::{CellMap, Model};
     use rand::RngExt;
 
-    /// Returns a model whose no-fly cells are marked by `#`.
-    fn model(rows: [&str; 3]) -> Model {
+    /// Returns a model whose rows of no-fly cells are marked by `#`.
+    fn model(rows: &str) -> Model {
         let of_row = |row: &str| row.bytes().map(|it| u8::from(it == b'#')).collect();
         let mut file = Model::wildfire().file().clone();
-        file.no_fly = Some(CellMap::Rows(rows.map(of_row).to_vec()));
+        file.no_fly = Some(CellMap::Rows(rows.split(' ').map(of_row).collect()));
         Model::new(file).expect("a model")
     }
 
     #[test]
     fn enclosed_fixed_starts_are_named_with_the_cells_they_reach() {
         let shape = Shape::new(3, 6).expect("a shape");
-        let pocket = model(["..#...", "###...", "......"]).airspace(shape);
+        let pocket = model("..#... ###... ......").airspace(shape);
         let pocket = pocket.expect("the grid");
         let reach = |start| Reach::of(start, &pocket, 2).expect("a start that can be left");
         let corner = reach(Start::Corner);
@@ -176,19 +176,19 @@ mod tests {
         let shape = Shape::new(3, 6).expect("a shape");
         for (rows, start, expected, got) in [
             (
-                ["#.....", "......", "......"],
+                "#..... ...... ......",
                 Start::Corner,
                 "robots may be",
                 "(0, 0), a no-fly",
             ),
             (
-                [".#....", "#.....", "......"],
+                ".#.... #..... ......",
                 Start::Corner,
                 "can leave",
                 "(0, 0), which no-fly",
             ),
             (
-                ["#.#.#.", ".#.#.#", "#.#.#."],
+                "#.#.#. .#.#.# #.#.#.",
                 Start::Random,
                 "can leave",
                 "no two adjacent",
@@ -205,11 +205,11 @@ mod tests {
 
     #[test]
     fn random_starts_on_a_connected_map_are_all_free_cells() {
-        let rows = [".#....", ".####.", "......"];
+        let rows = ".#.... .####. ......";
         let shape = Shape::new(3, 6).expect("a shape");
         let rules = Rules::new(&model(rows), shape, 0, 0, Start::Random).expect("rules");
-        let is_free = |&at: &usize| rows.concat().as_bytes()[at] == b'.';
-        let free: Vec<usize> = (0..18).filter(is_free).collect();
+        let cells = rows.replace(' ', "");
+        let free: Vec<usize> = cells.match_indices('.').map(|(at, _)| at).collect();
         for (seed, robot) in (0..200).zip([0, 1].into_iter().cycle()) {
             let mut stream = stream(seed, Purpose::Start, robot as u64);
             let expected = shape.cell(free[stream.random_range(0..free.len())]);

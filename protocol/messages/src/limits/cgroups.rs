@@ -29,7 +29,6 @@ struct Mount {
     folder: PathBuf,
 }
 
-/// Returns the limits that a controller sets for this process, read from the files below `root`.
 pub(super) fn limits(root: &Path, controller: &Controller) -> Vec<CgroupLimit> {
     let read = |path: &str| std::fs::read_to_string(root.join(path)).unwrap_or_default();
     let (own, mounts) = (read("proc/self/cgroup"), read("proc/self/mountinfo"));

@@ -25,7 +25,6 @@ pub struct NoMemory {
     got: String,
 }
 
-/// A limit on the memory of this process in bytes.
 #[derive(Debug, PartialEq, Eq)]
 struct Limit {
     free: u64,
@@ -33,9 +32,6 @@ struct Limit {
 }
 
 /// Checks that this process can allocate `n_bytes` for `what`.
-///
-/// # Errors
-/// If the machine, a cgroup or a `ulimit` has less memory.
 pub fn check(what: impl Display, n_bytes: u64) -> Result<(), NoMemory> {
     check_below(Path::new("/"), &what, n_bytes)?;
     // Some limits appear in no file, such as the limit on overcommitted memory.
@@ -47,7 +43,6 @@ pub fn check(what: impl Display, n_bytes: u64) -> Result<(), NoMemory> {
     }
 }
 
-/// Returns the error for an allocation that failed.
 pub fn refused(what: impl Display, n_bytes: u64) -> NoMemory {
     let none = |_| NoMemory {
         what: what.to_string(),
@@ -58,9 +53,6 @@ pub fn refused(what: impl Display, n_bytes: u64) -> NoMemory {
 }
 
 /// Allocates an empty vector whose capacity depends on external input.
-///
-/// # Errors
-/// If there is not enough memory.
 pub fn with_capacity<T>(what: impl Display, capacity: usize) -> Result<Vec<T>, NoMemory> {
     let mut empty = Vec::new();
     let n_bytes = capacity.saturating_mul(size_of::<T>()) as u64;
@@ -100,7 +92,6 @@ fn limits(root: &Path) -> Vec<Limit> {
         .collect()
 }
 
-/// Returns the limit of the machine, which all processes share.
 fn of_machine(root: &Path) -> Option<Limit> {
     let text = std::fs::read_to_string(root.join("proc/meminfo")).ok()?;
     Some(Limit {

@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
 use thiserror::Error;
 
-/// The first bytes of every recording.
 pub const MAGIC: [u8; 8] = *b"EMBERREC";
 
 /// Versions of the format that can be read, each the protocol version of the samples. The last one is written. A file
@@ -27,7 +26,6 @@ pub const MAX_BODY_BYTES: usize =
 /// cannot compress.
 pub const MAX_STORED_BYTES: usize = MAX_BODY_BYTES + MAX_BODY_BYTES / 1024 + 64;
 
-/// The header of a file.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct FileHeader {
@@ -37,14 +35,12 @@ pub struct FileHeader {
     pub reserved: u32,
 }
 
-/// The header of a record, before its body.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct RecordHeader {
     /// Time in nanoseconds since the recording began; never less than in the previous record.
     pub nanos: u64,
     pub kind: u32,
-    /// Size of the stored body in bytes.
     pub length: u32,
     /// Number of samples of the same channel that the recorder missed directly before this record.
     pub n_lost: u32,
@@ -72,13 +68,11 @@ pub struct Record {
     /// Number of samples of the same channel that the recorder missed directly before this record; 0 if the record is a
     /// server.
     pub n_lost: u32,
-    /// The content of the record.
     pub event: Event,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
-    /// The server that published the following samples.
     Server(Box<ServerInfo>),
     /// The frames of a world's robots, and the paths that they flew.
     Frame(Sample<FrameHeader>),
@@ -92,9 +86,7 @@ pub struct Totals {
     pub n_servers: u64,
     pub n_frames: u64,
     pub n_truths: u64,
-    /// Number of frames that the recorder missed.
     pub n_lost_frames: u64,
-    /// Number of hidden states that the recorder missed.
     pub n_lost_truths: u64,
 }
 

@@ -39,10 +39,6 @@ impl Progress {
         }
     }
 
-    /// Checks and counts a record.
-    ///
-    /// # Errors
-    /// If the record does not fit the previous records. The error contains the expected value.
     pub(super) fn accept(&mut self, record: &Record) -> Result<(), String> {
         if record.nanos < self.nanos {
             let (expected, got) = (self.nanos, record.nanos);

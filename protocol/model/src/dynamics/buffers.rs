@@ -21,7 +21,6 @@ pub(super) struct Buffers {
     on_grid: Arc<[u64]>,
     /// The marked cells of a band, each as the index of its home.
     pub(super) listed: Vec<u32>,
-    /// Random numbers for the marked cells.
     pub(super) randoms: Vec<u8>,
 }
 
@@ -43,7 +42,6 @@ impl Buffers {
         n_places + n_homes + (2 * in_band + LANES) * size_of::<u32>()
     }
 
-    /// Returns the homes of each band.
     pub(super) fn bands(&self) -> impl Iterator<Item = Range<usize>> + use<> {
         let n_homes = self.places.next.len();
         let bands = (0..n_homes).step_by(BAND);

@@ -22,7 +22,6 @@ use std::collections::BTreeMap;
 /// Number of units of a hazard of 1.
 const UNIT: f64 = (1_u64 << 40) as f64;
 
-/// Factor that covers the rounding errors of [`count`].
 const MARGIN: f64 = 1.0 + 1e-6;
 
 /// The tables computed from the transitions and the grid, which all worlds share.
@@ -31,7 +30,6 @@ pub(super) struct Tables {
     /// For each state that can change, a bound of the probability with which it does.
     bounds: Vec<Bound>,
     changes: Vec<Changes>,
-    /// The offset of a cell from its home.
     centre: usize,
 }
 

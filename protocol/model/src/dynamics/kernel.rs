@@ -2,7 +2,6 @@
 
 use super::super::parameters::Ratio;
 
-/// The weights of eq. 2.
 #[derive(Debug, Clone)]
 pub(super) struct Kernel {
     pub(super) n_states: usize,

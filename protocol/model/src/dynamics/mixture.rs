@@ -2,7 +2,6 @@
 
 use super::kernel::Kernel;
 
-/// A kernel as a mixture over taps.
 #[derive(Debug)]
 pub(super) struct Mixture<'k> {
     kernel: &'k Kernel,
@@ -55,7 +54,6 @@ impl<'k> Mixture<'k> {
         &self.counts
     }
 
-    /// Returns the probability of a tap.
     pub(super) fn share(&self, tap: usize) -> f64 {
         self.most[tap] / self.total
     }
@@ -78,7 +76,6 @@ impl<'k> Mixture<'k> {
     }
 }
 
-/// Returns, for each state, the next state with the largest sum of weights.
 fn likeliest(kernel: &Kernel) -> Vec<usize> {
     let likeliest = |from| {
         let sum = |to: usize| {

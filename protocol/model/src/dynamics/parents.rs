@@ -54,7 +54,6 @@ struct Rule {
     outcomes: u32,
 }
 
-/// One slot of an alias table.
 #[derive(Debug, Clone, Copy, Default)]
 struct Slot {
     /// A random number below this threshold draws the first rule. Any other draws the second.

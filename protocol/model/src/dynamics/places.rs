@@ -37,7 +37,6 @@ impl Places {
         }
     }
 
-    /// Returns the number of places and the number of homes.
     pub(super) fn lengths(model: &Model, shape: Shape) -> (usize, usize) {
         let [kernel_height, kernel_width] = model.kernel_size();
         let stride = shape.width() + kernel_width - 1;

@@ -52,7 +52,6 @@ impl Tables {
         }
     }
 
-    /// Writes the next states of the cells in all bands.
     #[inline(always)] // Like the functions it calls, so that all are compiled for this processor's vectors.
     pub(super) fn advance(&self, [byte_key, draw_key]: Keys, buffers: &mut Buffers) {
         let mut words = Words::new(draw_key);
@@ -74,7 +73,6 @@ impl Tables {
         }
     }
 
-    /// Decides the remaining cells with the full sum of eq. 2.
     fn sum_kernel(&self, undecided: &[u32], places: &mut Places, words: &mut Words) {
         for &home in undecided {
             let home = home as usize;

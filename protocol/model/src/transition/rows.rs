@@ -17,7 +17,6 @@ pub(super) type Lanes = [f32; LANES];
 #[derive(Debug, Clone)]
 pub(super) struct Row {
     bias: f32,
-    /// Groups of taps, each with its weight.
     terms: Vec<(usize, f32)>,
 }
 

@@ -56,7 +56,6 @@ fn hazards(text: &str) -> Result<Model, ModelError> {
 /// Each row: a part of [`RATIO`] => its replacement => a part of the resulting error.
 const WRONG: &str = r##"
 name = "land" => name = 3 => model file: 
-states = [ => states = [], no = [ => model file: 
 "b", color => "a", color => state name "a" appears twice
 "a", color => "explore", color => state name: expected letters, digits, '-' and '_', and none of
 "a", color => "a b", color => state name: expected letters, digits, '-' and '_', and none of
@@ -68,7 +67,6 @@ bias = 0.0 => bias = nan => state "a": bias: expected a finite number >= 0, got 
 bias = 0.0 => bias = 1e101 => bias: expected 0, or a magnitude of 1e-100 to 1e100, got 1e101
 bias = 0.0 => bias = 1e-320 => bias: expected 0, or a magnitude of 1e-100 to 1e100, got
 reward = 1.0 => reward = -1e101 => reward: expected 0, or a magnitude of 1e-100 to 1e100, got -1e101
-reward = 1.0 => reward = -1e-320 => reward: expected 0, or a magnitude of 1e-100 to 1e100, got
 reward = 1.0 => reward = inf => reward: expected a finite number, got inf
 initial = 0.75 => initial = 0.5 => initial: expected a sum of 1, got 0.75
 observed_as = [0.0, 1.0] => observed_as = [0.5, 0.4] => state "b": observed_as: expected a sum of 1, got 0.9
@@ -79,9 +77,7 @@ kernel_size = [1, 1] => kernel_size = [3, 5] => expected 3 rows of 5 weights, go
 kernel_size = [1, 1] => kernel_size = [1, 2] => kernel_size: expected two odd numbers up to 15, got [1, 2]
 kernel_size = [1, 1] => kernel_size = [2, 1] => kernel_size: expected two odd numbers up to 15, got [2, 1]
 kernel_size = [1, 1] => kernel_size = [17, 1] => kernel_size: expected two odd numbers up to 15, got [17, 1]
-kernel_size = [1, 1] => kernel_size = [15, 99999999] => kernel_size: expected two odd numbers
 kernel_size = [1, 1] => kernel_size = [9223372036854775807, 9223372036854775807] => kernel_size: expected two odd numbers
-kernel_size = [1, 1] => kernel_size = [-1, 3] => model file: 
 [[0.5]] => [[1e101]] => to "a": expected 0, or a magnitude of 1e-100 to 1e100, got 1e101
 scale = 1.0, weights = [[1.0]] => scale = 1e-99, weights = [[1e-99]] => expected 0, or a magnitude of 1e-100 to 1e100, got
 scale = 1.0 => scale = nan => expected finite weights >= 0, got NaN
@@ -115,7 +111,6 @@ to = "b" => to = "ash" => transition from "a" to "ash": expected the name of a s
 to = "b" => to = "a" => transition from "a" to "a": expected another state, got "a"
 near.b => near.ash => transition from "a" to "b": near.ash: expected the name of a state, one of ["a", "b"], got "ash"
 base = 0.25 => base = 1.5 => transition from "a" to "b": base: expected a probability: 0, or 1e-9 to 1, got 1.5
-base = 0.25 => base = -0.1 => base: expected a probability: 0, or 1e-9 to 1, got -0.1
 base = 0.25 => base = 1e-10 => base: expected a probability: 0, or 1e-9 to 1, got 0.0000000001
 base = 0.25 => base = nan => base: expected a probability: 0, or 1e-9 to 1, got NaN
 [[0.5, 0.0, 1e-9]] => [[0.5, 0.0, 2.0]] => near.b: expected a probability: 0, or 1e-9 to 1, got 2
@@ -175,19 +170,6 @@ fn a_model_file_survives_toml() {
 #[test]
 fn sums_of_weights_are_checked_where_the_grid_allows_them() {
     let mut file = Model::wildfire().file().clone();
-    for entry in file.kernel.iter_mut().filter(|it| it.from == "latent") {
-        entry.scale *= 1e-31;
-    }
-    let error = checked(file.clone()).check_on(shape(4, 4));
-    let error = error.expect_err("a cell among latent ones");
-    assert!(
-        matches!(error, ModelError::FaintWeight { share, .. } if share > 0.0),
-        "{error}"
-    );
-    file.states[0].bias = 1e-6;
-    assert_eq!(checked(file).check_on(shape(4, 4)), Ok(()));
-
-    let mut file = Model::wildfire().file().clone();
     file.kernel.iter_mut().for_each(|it| it.weights[1][1] = 0.0);
     let model = checked(file);
     assert_eq!(model.check_on(shape(5, 9)), Ok(()));
@@ -201,10 +183,6 @@ fn sums_of_weights_are_checked_where_the_grid_allows_them() {
 #[test]
 fn models_of_any_size_are_refused_before_memory_is_asked_for() {
     let mut file = Model::wildfire().file().clone();
-    let check = |file, words: &str| {
-        let error = Model::new(file).expect_err(words).to_string();
-        assert!(error.contains(words), "{error}");
-    };
     let state = |index| StateEntry {
         name: format!("s{index}"),
         initial: 1.0 / 64.0,
@@ -212,10 +190,9 @@ fn models_of_any_size_are_refused_before_memory_is_asked_for() {
     };
     for n_states in [1, 65, 10_000] {
         file.states = (0..n_states).map(state).collect();
-        check(
-            file.clone(),
-            &format!("expected 2 to 64 states, got {n_states}"),
-        );
+        let words = format!("expected 2 to 64 states, got {n_states}");
+        let error = Model::new(file.clone()).expect_err(&words).to_string();
+        assert!(error.contains(&words), "{error}");
     }
 }
 
