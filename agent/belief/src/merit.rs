@@ -43,7 +43,6 @@ pub struct MeritTally {
     /// The step of the last visit to each cell, row-major. 0 if the cell was never visited.
     last_visits: Vec<u32>,
     n_seen: usize,
-    /// The step of the first detection, and the number of burning cells at that step.
     detection: Option<(u32, u32)>,
     burning_seen: Mean,
     distance: Mean,
@@ -97,7 +96,6 @@ impl MeritTally {
         }
     }
 
-    /// Updates the figures that need the hidden states.
     fn watch(&mut self, flights: &[Flight], states: &Grid<u8>) {
         let states = states.as_slice().expect("invariant: grids are row-major");
         let forgotten = self.step.saturating_sub(RECENT_STEPS);
@@ -135,8 +133,7 @@ impl Mean {
     }
 }
 
-/// Returns the number of moves from a cell to the nearest cell that satisfies `is_one`, or `best` if no such cell is
-/// nearer. Scans row by row, from the nearest rows outwards.
+/// Returns the moves to the nearest cell that satisfies `is_one`, or `best` if none is nearer.
 fn nearest(shape: Shape, from: Cell, mut best: usize, is_one: impl Fn(usize) -> bool) -> usize {
     let (height, width) = shape.dim();
     for row_moves in 0..height {

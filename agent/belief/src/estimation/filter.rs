@@ -71,7 +71,6 @@ impl BayesFilter {
         }
     }
 
-    /// Updates the cavities after a correction of the belief.
     pub(super) fn correct_cavities(&mut self) {
         if self.prediction.has_cavities() {
             self.prediction
@@ -81,12 +80,10 @@ impl BayesFilter {
         }
     }
 
-    /// Returns the number of bytes of [`Handover::to_bytes`].
     pub(super) fn n_bytes(&self) -> usize {
         4 * self.belief.as_slice().len() + self.prediction.n_bytes()
     }
 
-    /// Returns the belief and `P(y | x)`, shape `[S, O]`.
     pub(super) fn parts(&self) -> (&Belief, &Array2<f64>) {
         (&self.belief, &self.likelihood)
     }
@@ -97,8 +94,6 @@ impl BayesFilter {
 }
 
 impl Estimator for BayesFilter {
-    /// # Panics
-    /// If the frame's grid differs from the belief's, or the model lacks one of the frame's observations.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         correct(&mut self.belief, &self.likelihood, frame)?;
         self.correct_cavities();

@@ -13,7 +13,6 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
-/// Maximum number of cached files.
 const MAX_FILES: usize = 32;
 
 /// Maximum size of a cached belief in bytes: 512 x 512 cells with four states.
@@ -21,10 +20,8 @@ const MAX_BYTES: usize = 4 << 20;
 
 const CHECKSUM_BYTES: usize = 4;
 
-/// Maximum time to wait for a process that makes the same belief.
 const LONGEST_WAIT: Duration = Duration::from_secs(300);
 
-/// Interval between two attempts to lock.
 const PAUSE: Duration = Duration::from_millis(20);
 
 /// The right to make a belief. It ends with its process, unless a forked child has a copy of the descriptor.
@@ -132,9 +129,6 @@ impl KeptBelief {
     }
 
     /// Writes the belief for later runs, and removes the oldest files beyond the maximum number.
-    ///
-    /// # Errors
-    /// If the folder or the file cannot be written.
     pub fn write(&self, belief: &Belief) -> std::io::Result<()> {
         let mut bytes = self.key.clone().into_bytes();
         let values = belief.probabilities().iter();

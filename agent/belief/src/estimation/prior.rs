@@ -43,8 +43,7 @@ impl Prior {
         Ok(belief.expect("invariant: nothing cancels it"))
     }
 
-    /// Returns the belief as [`Self::belief`] does, but stops early and returns `None` if `cancelled` is set, because a
-    /// simulation can take minutes.
+    /// Like [`Self::belief`], but returns `None` once `cancelled` is set, because a simulation can take minutes.
     pub fn belief_unless(
         self,
         cancelled: &AtomicBool,
@@ -71,21 +70,15 @@ impl Prior {
     }
 }
 
-/// A simulation of several worlds in parallel.
 struct Simulation<'a> {
     dynamics: Dynamics,
-    /// The numbers of states, rows and columns: S, H and W.
     dim: (usize, usize, usize),
     seed: u64,
-    /// Number of simulated steps, starting from the initial distribution.
     burn_in: u64,
     cancelled: &'a AtomicBool,
 }
 
 impl Simulation<'_> {
-    /// Counts the worlds in which each cell is in each state, shape `[S, H, W]`. After a cancellation, the simulations
-    /// of the worlds stop early.
-    ///
     /// Counts are integers, so the order in which threads add them does not matter.
     fn counts(&self, n_worlds: usize) -> Array3<u32> {
         let none = || Array3::zeros(self.dim);
@@ -99,7 +92,6 @@ impl Simulation<'_> {
         counts.reduce(none, |a, b| a + b)
     }
 
-    /// Simulates one world and returns its states after burn-in.
     fn world(&self, world: usize) -> Grid<u8> {
         let world_seed = stream(self.seed, Purpose::Prior, world as u64).next_u64();
         let mut dynamics = self.dynamics.clone();
@@ -114,10 +106,7 @@ impl Simulation<'_> {
     }
 }
 
-/// Computes relative frequencies per cell, shrunk towards the frequencies of the whole grid.
-///
-/// The grid-wide frequencies count as [`POOLED_WORLDS`] additional worlds. A few worlds say little about one cell, and
-/// a state that never occurred in a cell is still possible there.
+/// A few worlds say little about one cell, and a state that never occurred in a cell is still possible there.
 fn average(counts: &Array3<u32>, n_states: usize, shape: Shape) -> Belief {
     let in_all = |state: usize| -> u32 { counts.index_axis(Axis(0), state).sum() };
     let totals: Vec<f64> = (0..n_states)

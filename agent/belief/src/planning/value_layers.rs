@@ -8,7 +8,6 @@ use ndarray::Zip;
 /// Radius of a region. A region contains all cells of the grid within this number of rows and columns of its centre.
 pub const REGION_RADIUS: usize = 6;
 
-/// Distance between the centres of the regions that are compared, in rows and in columns.
 const CENTRE_STRIDE: usize = 4;
 
 /// Probability of the paying state above which a cell is worth flying to.
@@ -88,14 +87,12 @@ impl ValueLayers {
         layers.cleared(&closed.map(|(cell, _)| cell).collect::<Vec<_>>(), &[])
     }
 
-    /// Sets layers to 0 in the cells that another robot visits. Layers that count in all cells in sight are set to 0 in
-    /// the cells that the other robot sees.
+    /// Sets layers to 0 in the cells that another robot visits, or, if they count in sight, sees.
     pub fn without(self, visited: &[usize]) -> Self {
         let seen = self.airspace.see(visited);
         self.cleared(visited, &seen)
     }
 
-    /// Sets layers to 0 in `visited` cells, or in `seen` cells if they count in all cells in sight.
     fn cleared(mut self, visited: &[usize], seen: &[usize]) -> Self {
         for layer in Layer::ALL {
             let in_sight = self.counts_in_sight(layer);
