@@ -71,8 +71,7 @@ impl Adam {
         self.update_with(settings, loss, Vec::new(), "")
     }
 
-    /// Performs a step as [`Self::update`] does, and also applies the changes in `statistics`. `prefix` precedes the
-    /// names of variables in errors.
+    /// `prefix` precedes the names of variables in errors.
     pub(crate) fn update_with(
         &mut self,
         settings: &AdamSettings,
@@ -106,7 +105,6 @@ impl Adam {
         NotFinite { update, tensor }.into()
     }
 
-    /// Computes the changes of parameters and moments in a step.
     fn changes(&self, settings: &AdamSettings, gradients: &GradStore) -> Result<Vec<Change>> {
         let betas = settings.betas.map(f64::from);
         let bias = betas.map(|beta| 1.0 - beta.powf((self.steps + 1) as f64));
@@ -140,7 +138,6 @@ impl Adam {
         Ok(changes)
     }
 
-    /// Returns the Euclidean norm of all gradients together.
     fn norm(&self, gradients: &GradStore) -> Result<f64> {
         let gradients = self.variables.values().filter_map(|var| gradients.get(var));
         let squares = gradients.map(|it| it.sqr()?.sum_all());
@@ -163,7 +160,6 @@ impl Adam {
         self.steps
     }
 
-    /// Sets the number of steps after which the loaded moments were saved.
     pub(crate) fn set_steps(&mut self, steps: u64) {
         self.steps = steps;
     }
@@ -173,7 +169,6 @@ fn names(variable: &str) -> [String; 2] {
     ["first", "second"].map(|which| format!("{which}.{variable}"))
 }
 
-/// Updates an exponential moving average with new values.
 fn towards(old: &Var, new: &Tensor, beta: f64) -> Result<Tensor> {
     let mean = ((old.as_detached_tensor() * beta)? + (new * (1.0 - beta))?)?;
     (mean + FLUSH)? - FLUSH

@@ -21,12 +21,10 @@ pub struct Transition {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Track {
     n_step: usize,
-    /// Steps with incomplete transitions, the oldest first.
     open: VecDeque<Transition>,
 }
 
 impl Track {
-    /// Creates an empty track whose transitions span `n_step` steps.
     pub(super) fn new(n_step: usize) -> Self {
         Self {
             n_step: n_step.max(1),
@@ -49,7 +47,6 @@ impl Track {
         std::iter::from_fn(|| self.complete()).collect()
     }
 
-    /// Returns the transition from the oldest step to the latest.
     fn complete(&mut self) -> Option<Transition> {
         let next = self.open.back()?.next.clone();
         let later = self.open.iter().rev();

@@ -11,8 +11,6 @@ use std::sync::OnceLock;
 /// depend on the number of threads.
 const N_SUMS: usize = 8;
 
-/// A convolution that keeps the image's size, or divides it by the stride.
-///
 /// Arguments: images `[batch, channels in, rows, cols]`, weights `[kernel * kernel * channels in, channels out]`, bias
 /// `[channels out]`. Result: `[batch, channels out, rows / stride, cols / stride]`.
 #[derive(Debug, Clone, Copy)]
@@ -21,12 +19,10 @@ pub(crate) struct ImageConv {
     pub(crate) kernel: usize,
     pub(crate) stride: usize,
     pub(crate) dilation: usize,
-    /// Whether ReLU follows the convolution.
     pub(crate) relu: bool,
 }
 
 impl ImageConv {
-    /// Applies the convolution to images.
     pub(crate) fn apply(self, x: &Tensor, weights: &Tensor, bias: &Tensor) -> Result<Tensor> {
         x.apply_op3(weights, bias, Call::new(self, false))
     }
@@ -36,7 +32,6 @@ impl ImageConv {
         x.apply_op3(weights, bias, Call::new(self, true))
     }
 
-    /// Returns the batch size, and the convolution for the given shapes.
     fn conv(&self, x: &Shape, weights: &Shape) -> Result<(usize, Conv)> {
         let (batch, channels, rows, cols) = x.dims4()?;
         let (patch, n) = weights.dims2()?;
@@ -61,12 +56,10 @@ impl ImageConv {
     }
 }
 
-/// One call of the operator.
 struct Call {
     conv: ImageConv,
     adds_image: bool,
-    /// Whether each result passed ReLU. The output of a residual layer does not reveal this, because it includes the
-    /// image.
+    /// The output of a residual layer does not reveal this, because it includes the image.
     kept: OnceLock<Vec<bool>>,
 }
 
@@ -79,7 +72,6 @@ impl Call {
         }
     }
 
-    /// Applies ReLU, and adds the image.
     #[inline(always)]
     fn finish(&self, x: &[f32], y: &mut [f32], kept: &mut [bool]) {
         if self.conv.relu {
@@ -214,12 +206,10 @@ impl CustomOp3 for Call {
     }
 }
 
-/// The inputs of the backward pass that are the same for all images.
 struct Back<'a> {
     call: &'a Call,
     conv: &'a Conv,
     weights: &'a [f32],
-    /// Whether the gradient of the image is needed.
     of_image: bool,
 }
 
