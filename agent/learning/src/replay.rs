@@ -16,7 +16,6 @@ pub struct Block {
     pub frames: Vec<Vec<Sighting>>,
     /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
     pub start: Option<Vec<f32>>,
-    /// The number of the track's next block.
     next: u64,
 }
 
@@ -25,7 +24,6 @@ pub struct BlockReplay {
     block_length: usize,
     max_frames: usize,
     full: BTreeMap<u64, Block>,
-    /// The block that receives new frames, for each robot.
     open: BTreeMap<u32, (u64, Block)>,
     n_opened: u64,
 }

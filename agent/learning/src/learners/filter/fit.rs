@@ -17,7 +17,6 @@ use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use emberwatch_model::{Frame, Shape};
 
-/// Suffixes of tensor names: parameters, mean gradients and mean squared gradients.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
 /// A filter that is fitted to frames as they arrive.

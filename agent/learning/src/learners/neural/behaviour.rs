@@ -7,7 +7,6 @@ use emberwatch_network::Sightings;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 
-/// Average number of steps between changes of behaviour.
 const STEPS: u64 = 20;
 
 /// Time constants in steps: how fast a seen cell regains its value for the aim `Cover`, and how fast an old sighting
@@ -23,16 +22,15 @@ pub struct Behaviour {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Aim {
-    /// Random moves.
     Walk,
-    /// Cells that have not been seen for a long time.
     Cover,
-    /// The goal cell.
     Far,
     /// Cells in which the observation with the highest reward was seen recently.
     Last,
     /// The policy's objective on the belief, plus `entropy / 10` times the belief's entropy.
-    Exploit { entropy: u8 },
+    Exploit {
+        entropy: u8,
+    },
 }
 
 /// Each aim with its two probabilities in per cent: while exploring, and later.
@@ -48,8 +46,7 @@ const AIMS: [(Aim, [u64; 2]); 8] = [
 ];
 
 impl Behaviour {
-    /// Returns the next behaviour: a random one with probability 1 / `STEPS` or at the beginning, otherwise the
-    /// previous one.
+    /// Returns another random behaviour with probability 1 / `STEPS` or at the beginning, otherwise the previous one.
     pub fn next(
         before: Option<Self>,
         is_exploring: bool,
@@ -104,7 +101,6 @@ impl Behaviour {
         }
     }
 
-    /// Computes the value of each cell for an aim that ignores the belief.
     fn value(&self, seen: &Sightings, target: usize, rng: &mut ChaCha8Rng) -> Grid<f32> {
         let shape = seen.shape();
         let (height, width) = shape.dim();

@@ -12,7 +12,6 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 use std::collections::{BTreeMap, VecDeque};
 
-/// Maximum number of frames per block.
 const BLOCK_FRAMES: usize = 256;
 
 /// A frame: its observed cells (row-major index and value), and the corrected filter's predictions for these cells,
@@ -34,7 +33,6 @@ pub struct LessonReplay {
     max_frames: usize,
     /// Blocks that are full or whose track has ended, oldest first.
     full: VecDeque<Block>,
-    /// The block that receives new frames, for each robot.
     open: BTreeMap<u32, Block>,
 }
 
@@ -87,10 +85,7 @@ impl LessonReplay {
         }
     }
 
-    /// Returns a robot's sightings so far.
-    ///
-    /// # Panics
-    /// If the robot has no track.
+    /// Returns a robot's sightings so far. Panics if the robot has no track.
     pub fn present(&self, robot: u32) -> Sightings {
         let block = &self.open[&robot];
         block.before_frame(block.frames.len())
@@ -122,7 +117,6 @@ impl LessonReplay {
 }
 
 impl Block {
-    /// Returns the sightings before one of the block's frames.
     fn before_frame(&self, at: usize) -> Sightings {
         let mut sightings = self.before.clone();
         for frame in &self.frames[..at] {
