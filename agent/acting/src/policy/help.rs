@@ -30,7 +30,6 @@ pub fn help() -> String {
     )
 }
 
-/// Formats a section. `lines` has the name and the description of each entry.
 fn section(title: &str, lines: impl Iterator<Item = (&'static str, &'static str)>) -> String {
     let lines: Vec<_> = lines.collect();
     let width = lines.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
