@@ -17,21 +17,16 @@ use std::time::Duration;
 /// The measurements of one world's run, summed over its steps.
 pub struct RunTally {
     seed: u64,
-    /// The state with the highest reward.
     target: usize,
-    /// Number of cells in that state, summed over steps.
     fire_cells: f64,
     rewards: Vec<f32>,
     reward: f64,
     n_visited: u64,
     n_hits: u64,
-    /// Number of distinct cells that each robot visits in a step, summed over robots and steps.
     n_visited_each: u64,
     planning: Duration,
-    /// Sum of Brier scores; `None` if hidden states are not published.
     brier: Option<f64>,
     score: Score,
-    /// Flights of the present step, collected until all robots have flown.
     flights: Vec<Flight>,
     merit: MeritTally,
 }

@@ -144,13 +144,9 @@ impl Lines {
     }
 }
 
-/// What all panels share.
 struct Frame {
-    /// The right edge of the plots.
     right: i32,
-    /// The last value of the horizontal axis.
     last: f64,
-    /// Maximum numbers of ticks of the horizontal and of the vertical axis.
     n_ticks: [usize; 2],
 }
 
@@ -238,7 +234,6 @@ impl Panel {
         Ok(area.draw_text(&title, &style(LABEL, INK, HPos::Left), (MARGIN, 18))?)
     }
 
-    /// Writes each curve's name next to its end on the page, with a connecting line.
     fn draw_names(&self, area: &Area<'_>, right: i32, ends: &[(i32, i32)]) -> Result<()> {
         let top = area.get_base_pixel().1;
         let heights: Vec<i32> = ends.iter().map(|end| end.1 - top).collect();

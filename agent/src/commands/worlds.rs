@@ -61,9 +61,6 @@ pub enum Source {
 
 impl SimulationFlags {
     /// Returns checked settings of worlds to simulate. `default`: the settings without flags.
-    ///
-    /// # Errors
-    /// If a setting is invalid, or a task or recorded states already decide it.
     pub fn check(&self, default: ServerConfig) -> Result<Checked, ConfigError> {
         check(&self.given(), default)
     }
@@ -94,11 +91,7 @@ impl WorldFlags {
         numbers.map(|number| number as u32).collect()
     }
 
-    /// Checks the settings of the worlds, without opening them. `n_robots`: the number of robots per world, if it was
-    /// given.
-    ///
-    /// # Errors
-    /// If the settings are invalid.
+    /// Checks the settings of the worlds without opening them. `n_robots`: robots per world, if given.
     pub fn source(&self, n_robots: Option<u32>) -> Result<Source> {
         if let Some(name) = &self.instance {
             return Ok(Source::Server(Instance::new(name)?));
@@ -152,9 +145,6 @@ impl Source {
     }
 
     /// Opens the worlds for a comparison on `n_seeds` seeds.
-    ///
-    /// # Errors
-    /// If there is no such server, the worlds cannot be simulated, or the model of beliefs does not fit them.
     pub fn open(self, n_seeds: u32) -> Result<ComparedWorlds> {
         match self {
             Self::Server(instance) => {
@@ -170,7 +160,6 @@ impl Source {
     }
 }
 
-/// Checks the default settings with the values that were given.
 fn check(given: &Map<String, Value>, mut default: ServerConfig) -> Result<Checked, ConfigError> {
     if given.get("robots").and_then(Value::as_u64) > Some(1) {
         // With the same start and the same belief, all robots would fly the same path forever.

@@ -36,8 +36,7 @@ impl Estimate {
     }
 }
 
-/// Returns the ratio of the means over the worlds that both have. Returns `None` if they share none, or if the
-/// reference's mean is not positive, where a ratio is meaningless.
+/// Returns the ratio of the means over common worlds. `None` without any, or if the reference's mean is not positive.
 pub fn ratio_of_means(values: &BTreeMap<u64, f64>, reference: &BTreeMap<u64, f64>) -> Option<f64> {
     let (above, below): (Vec<f64>, Vec<f64>) = shared(values, reference).unzip();
     let (above, below): (f64, f64) = (above.iter().sum(), below.iter().sum());
