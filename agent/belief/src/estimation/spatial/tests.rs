@@ -81,14 +81,19 @@ fn an_impossible_frame_changes_nothing_with_or_without_spread() {
 
 #[test]
 fn a_tiny_probability_does_not_count_as_zero() {
-    let model = wildfire(|file| file.states[FIRE].observed_as = vec![0.0, 0.02, 0.98]);
-    let prior = ndarray::arr3(&[[[1e-9]], [[0.0]], [[1.0]]]);
+    let model = wildfire(|file| {
+        file.states[0].observed_as = vec![1.0, 0.0, 0.0];
+        file.states[FIRE].observed_as = vec![0.999, 0.0005, 0.0005];
+    });
+    let prior = ndarray::arr3(&[[[1.0]], [[0.0]], [[f32::MIN_POSITIVE]]]);
     let prior = Belief::from_probabilities(prior).expect("a belief");
     let filter = BayesFilter::known(&model, prior, false).expect("valid");
-    let mut filter = SpatialFilter::new(filter, FIRE, Correlations::default());
-    let frame = Frame::from_bytes(shape(1, 1), 3, &[0]).expect("a frame");
-    filter.correct(&frame).expect("possible");
-    assert_eq!(filter.belief().as_slice(), [1.0, 0.0, 0.0]);
+    for neighbours in [None, Some((FIRE, Correlations::default()))] {
+        let mut filter = correcting(filter.clone(), neighbours);
+        let frame = Frame::from_bytes(shape(1, 1), 3, &[2]).expect("a frame");
+        filter.correct(&frame).expect("possible");
+        assert_eq!(filter.belief().as_slice(), [0.0, 0.0, 1.0]);
+    }
 }
 
 /// Returns a model of three or four states in which only one state, chosen by `paying`, has a reward.
