@@ -189,8 +189,7 @@ impl Handover for NeuralEstimator {
         if self.failure.is_some() {
             return Vec::new();
         }
-        let filter = self.filter.as_ref();
-        let filter = filter.map_or(Vec::new(), |it| it.to_bytes());
+        let filter = self.filter.as_ref().map_or(Vec::new(), |it| it.to_bytes());
         [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()
     }
 

@@ -248,15 +248,10 @@ mod tests {
         let quotients = [0, 5_000, 50_000, 500_000, 500_000_000].map(quotient);
         assert!(quotients.is_sorted_by(|a, b| a > b), "{quotients:?}");
         assert!(quotients[4] < 0.04 * quotients[0]);
-        let constant = AgentConfig::paper().autoencoder.step_size;
-        assert_eq!(constant.at(1_000_000), 1e-4);
-    }
-
-    #[test]
-    fn settings_reach_the_networks() {
-        let config = AgentConfig::paper();
-        assert_eq!(config.autoencoder.settings(), AutoencoderSettings::paper());
-        assert_eq!(config.dqn.settings(), DqnSettings::paper());
+        let paper = AgentConfig::paper();
+        assert_eq!(paper.autoencoder.step_size.at(1_000_000), 1e-4);
+        assert_eq!(paper.autoencoder.settings(), AutoencoderSettings::paper());
+        assert_eq!(paper.dqn.settings(), DqnSettings::paper());
     }
 
     #[test]

@@ -157,10 +157,8 @@ mod tests {
     #[test]
     fn a_lesson_contains_all_earlier_sightings_of_its_robot() {
         let replay = replay(300, 1000);
-        assert_eq!(
-            (replay.full.len(), replay.present(3).last(0)),
-            (2, Some((98, 2)))
-        );
+        assert_eq!(replay.full.len(), 2);
+        assert_eq!(replay.present(3).last(0), Some((98, 2)));
         let lessons = replay.lessons(500, &mut stream(1, Purpose::Replay, 0));
         assert!((400..500).contains(&lessons.len()), "a tenth shows nothing");
         for Lesson { before, frame, .. } in lessons {
