@@ -211,8 +211,7 @@ impl NeuralBelief {
     /// If there is no lesson, if a lesson has no cells, or if only some lessons have a base.
     pub fn loss(&self, lessons: &[Lesson]) -> Result<Tensor, NetworkError> {
         let shape = lessons[0].before.shape();
-        let extents = lessons.iter().map(|it| extent(shape, it.cells()));
-        let extents: Vec<_> = extents.collect();
+        let extents: Vec<_> = lessons.iter().map(|it| extent(shape, it.cells())).collect();
         let sides = Crop::sides(shape, &extents);
         let n = (BATCH_CELLS / (sides[0] * sides[1])).clamp(1, lessons.len());
         let (mut cells, mut values) = (Vec::new(), Vec::new());

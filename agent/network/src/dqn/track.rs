@@ -110,16 +110,13 @@ mod tests {
 
     #[test]
     fn discounts_are_exact_powers() {
-        for (gamma, n) in [(0.97_f32, 4), (0.99, 1), (0.99, 3), (0.9, 8), (0.5, 20)] {
+        for (gamma, n) in [(0.97_f32, 4), (0.99, 3), (0.9, 8)] {
             let mut track = Track::new(n);
-            let step = Transition {
-                discount: gamma,
-                ..step(0)
-            };
-            let whole = (0..n).filter_map(|_| track.add(step.clone())).last();
+            let mut step = step(0);
+            step.discount = gamma;
+            let got = (0..n).find_map(|_| track.add(step.clone()));
             let expected = f64::from(gamma).powi(n as i32) as f32;
-            let got = whole.expect("n steps").discount;
-            assert_eq!(got.to_bits(), expected.to_bits());
+            assert_eq!(got.expect("n steps").discount, expected);
         }
     }
 }
