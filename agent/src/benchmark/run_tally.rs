@@ -93,8 +93,7 @@ impl RunTally {
     /// Summarises the run as a row of the results.
     pub fn into_run(self, policy: &Policy, team: Team, info: &ServerInfo) -> PolicyRun {
         let (steps, merit) = (self.rewards.len() as u64, self.merit.merit());
-        let brier = self.brier;
-        let brier = brier.filter(|_| policy.belief.input != Input::Nothing);
+        let brier = self.brier.filter(|_| policy.belief.input != Input::Nothing);
         let mean = |sum: f64| sum / steps.max(1) as f64;
         let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
         PolicyRun {

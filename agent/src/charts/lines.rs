@@ -129,8 +129,7 @@ impl Lines {
                 Scale::Linear => panel.draw(&area, &frame, covering(values()))?,
                 Scale::Logarithmic => {
                     let least = values().fold(f64::MAX, f64::min).log10().floor();
-                    let most = values().fold(0.0, f64::max).log10().ceil();
-                    let most = most.max(least + 1.0);
+                    let most = values().fold(0.0, f64::max).log10().ceil().max(least + 1.0);
                     // Slightly more than the powers of ten, because plotters rounds their ticks.
                     let range = 0.999 * 10_f64.powf(least)..1.001 * 10_f64.powf(most);
                     panel.draw(&area, &frame, range.log_scale())?;
