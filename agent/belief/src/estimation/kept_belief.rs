@@ -302,21 +302,14 @@ mod tests {
     #[test]
     fn the_oldest_files_are_removed() {
         let folder = tempfile::TempDir::new().expect("a folder");
-        for (name, seconds) in [
-            ("a.belief", 20),
-            ("b.belief", 10),
-            ("c.belief", 30),
-            ("d.lock", 1),
-        ] {
+        let names = ["a.belief", "b.belief", "c.belief", "d.lock"];
+        for (name, seconds) in names.into_iter().zip([20, 10, 30, 1]) {
             let file = File::create(folder.path().join(name)).expect("a file");
             let changed = SystemTime::UNIX_EPOCH + Duration::from_secs(seconds);
             file.set_modified(changed).expect("a time");
         }
         remove_oldest(folder.path(), 2);
-        let is_there = |name| folder.path().join(name).exists();
-        assert_eq!(
-            ["a.belief", "b.belief", "c.belief", "d.lock"].map(is_there),
-            [true, false, true, true]
-        );
+        let left = names.map(|name| folder.path().join(name).exists());
+        assert_eq!(left, [true, false, true, true]);
     }
 }

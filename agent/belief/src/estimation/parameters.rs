@@ -269,14 +269,9 @@ mod tests {
         }
         assert!(tables.kernel.iter().all(|&w| w > 0.0));
         assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
-        check_chain_rule(dimensions());
-    }
-
-    /// Checks gradients against finite differences.
-    fn check_chain_rule(dimensions: Dimensions) {
-        let parameters = Parameters::first(dimensions, 3);
+        let parameters = Parameters::first(dimensions(), 3);
         // The function to differentiate: a linear function of the tables with arbitrary factors.
-        let factors: [Vec<f64>; 3] = dimensions.lengths().map(|length| {
+        let factors: [Vec<f64>; 3] = dimensions().lengths().map(|length| {
             let factor = |index| (index as f64 * 0.7).sin();
             (0..length).map(factor).collect()
         });
@@ -307,17 +302,14 @@ mod tests {
 
     #[test]
     fn dimensions_out_of_range_are_named() {
-        type Change = fn(&mut Dimensions);
-        let changes: [(Change, &str); 3] = [
-            (|it| it.n_states = 1, "states: expected 2 to 64, got 1"),
-            (|it| it.n_observations = 65, "got 65"),
-            (|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2"),
-        ];
-        for (change, words) in changes {
+        let refused = |change: fn(&mut Dimensions), words: &str| {
             let mut dimensions = dimensions();
             change(&mut dimensions);
             let error = dimensions.check().expect_err(words);
             assert!(error.contains(words), "{error}");
-        }
+        };
+        refused(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
+        refused(|it| it.n_observations = 65, "got 65");
+        refused(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
     }
 }

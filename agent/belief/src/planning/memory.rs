@@ -136,8 +136,9 @@ mod tests {
     #[test]
     fn rewards_are_remembered_per_move() {
         let mut memory = Memory::new(Shape::new(1, 1).expect("test shape"));
-        memory.earn(6.0, 12);
-        memory.earn(0.0, 12);
+        [6.0, 0.0]
+            .into_iter()
+            .for_each(|reward| memory.earn(reward, 12));
         let recent = memory.recent;
         assert_eq!((recent.last_reward, recent.n_paths), (0.0, 2));
         assert!((recent.mean_reward - 0.08).abs() < 1e-6);

@@ -229,8 +229,7 @@ impl CellValues {
         let Some(in_sight) = &self.in_sight else {
             return 0.0;
         };
-        let in_sight = in_sight.as_slice();
-        let in_sight = in_sight.expect("invariant: grids are row-major");
+        let in_sight = in_sight.as_slice().expect("invariant: grids are row-major");
         let visited = self.airspace.fly(start, moves).visited;
         let seen = self.airspace.see(&visited);
         seen.iter().map(|&cell| in_sight[cell]).sum()

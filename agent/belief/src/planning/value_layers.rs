@@ -198,20 +198,16 @@ impl Sums {
 mod tests {
     use super::*;
 
-    fn layers(height: usize, width: usize) -> ValueLayers {
-        let shape = Shape::new(height, width).expect("test shape");
-        let random = |(row, col)| {
-            (emberwatch_model::randomness::split_mix(row as u64, col as u64) % 3) as u8
-        };
-        let states = Grid::from_shape_fn((height, width), random);
-        let belief = Belief::from_states(&states, 3).expect("valid states");
-        ValueLayers::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12)
-    }
-
     #[test]
     fn sums_around_a_cell_agree_with_plain_sums() {
         for (height, width) in [(1, 1), (3, 20), (20, 15), (64, 64)] {
-            let layers = layers(height, width);
+            let shape = Shape::new(height, width).expect("test shape");
+            let states = Grid::from_shape_fn((height, width), |(row, col)| {
+                (emberwatch_model::randomness::split_mix(row as u64, col as u64) % 3) as u8
+            });
+            let belief = Belief::from_states(&states, 3).expect("valid states");
+            let open = Airspace::open(shape);
+            let layers = ValueLayers::new(&belief, &open, 2, &Memory::new(shape), 12);
             let cells = |layer| layers.layer(layer).indexed_iter();
             for centre in layers.centres().chain([layers.shape().cell(0)]) {
                 let near = |(row, col): (usize, usize)| {

@@ -8,7 +8,7 @@ use emberwatch_model::hazards::scaled;
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Cell, Grid, MapsEntry, Shape};
 use exact::divergences;
-use ndarray::{Array3, ArrayD, ArrayView, Axis, s};
+use ndarray::{Array3, ArrayD, Axis, s};
 
 fn shape(height: usize, width: usize) -> Shape {
     Shape::new(height, width).expect("test shape")
@@ -95,12 +95,6 @@ fn framed(inner: &Belief) -> Belief {
     let mut cells = framed.slice_mut(s![.., 2..height + 2, 2..width + 2]);
     cells.assign(&inner.view());
     Belief::from_probabilities(framed).expect("a belief")
-}
-
-/// Returns the largest difference between two beliefs.
-fn off(got: &Probabilities, expected: &Probabilities) -> f32 {
-    let differences = (got - expected).mapv(f32::abs);
-    differences.fold(0.0, |worst, d| d.max(worst))
 }
 
 /// Returns the prediction without cavities, from the formula of the module's page, in double precision.
@@ -190,40 +184,13 @@ fn predictions_are_those_of_the_formula() {
         for model in [with_edge(&tangle), tangle, with_edge(&land), land, fire] {
             check_formula(&model, belief(3, shape), [0.0, 1e-6]);
         }
-    }
-}
-
-/// Returns the text of random transitions, with probabilities from 1e-7 to .7 and tables of up to 5 x 5 cells.
-fn random_transitions(seed: u64) -> String {
-    let mut at = 0..;
-    let mut random = || random(seed, at.next().expect("endless"));
-    let mut text = String::new();
-    for (from, to) in [(0, 1), (1, 2), (2, 0)] {
-        let [from, to] = [from, to].map(|state| ["green", "fire", "ash"][state]);
-        let mut p = |scale: f64| scale * (1e-7_f64 / 0.7).powf(random());
-        text += &format!(
-            "[[transitions]]\nfrom = \"{from}\"\nto = \"{to}\"\nbase = {:?}\n",
-            p(0.1)
-        );
-        for (index, source) in ["fire", "ash"].into_iter().enumerate() {
-            let side = 1 + 2 * ((seed as usize + index) % 3);
-            let mut rows = vec![vec![0.0; side]; side];
-            let cells = rows.iter_mut().flatten().enumerate();
-            cells.for_each(|(cell, it)| *it = if cell == side * side / 2 { 0.0 } else { p(0.7) });
-            text += &format!("near.{source} = {rows:?}\n");
-        }
-    }
-    text
-}
-
-#[test]
-fn a_cell_is_predicted_to_a_relative_1e_5_by_a_thousand_random_models() {
-    for seed in 0..1000 {
-        let states = Grid::from_shape_fn((5, 6), |(row, col)| {
-            (3.0 * random(seed, row * 6 + col)) as u8
+        // Rare events are not rounded to 0 or to a multiple of 6e-8.
+        let rare = model(&FIRE.replace("0.4", "1e-7"));
+        let states = Grid::from_shape_fn(shape.dim(), |(row, col)| {
+            (3.0 * random(7, row * 100 + col)) as u8
         });
-        let belief = Belief::from_states(&states, 3).expect("states");
-        check_formula(&model(&random_transitions(seed)), belief, [1e-5, 0.0]);
+        let certain = Belief::from_states(&states, 3).expect("states");
+        check_formula(&rare, certain, [1e-5, 0.0]);
     }
 }
 
@@ -242,8 +209,8 @@ fn an_edge_state_equals_a_border_of_cells_in_that_state() {
             prediction.predict(&mut got);
             of_frame.predict(&mut expected);
             let inner = expected.view().slice(s![.., 2..7, 2..9]).to_owned();
-            let off = off(got.probabilities(), &inner);
-            assert!(off < 2e-6, "{cavities}, step {step}: {off}");
+            let off = (got.probabilities() - &inner).mapv(f32::abs);
+            assert!(off.iter().all(|off| *off < 2e-6), "{cavities}, step {step}");
             let reset = framed(&got);
             of_frame.correct(expected.as_slice(), reset.as_slice());
             expected = reset;
@@ -269,15 +236,9 @@ fn cavities_are_closer_to_the_exact_filter() {
 
 #[test]
 fn the_paper_s_rule_has_no_cavities() {
-    let model = Model::wildfire();
-    let mut plain = belief(3, shape(6, 7));
-    let mut with = plain.clone();
-    let mut prediction = Prediction::known(&model, &plain, true).expect("fits");
+    let belief = belief(3, shape(6, 7));
+    let mut prediction = Prediction::known(&Model::wildfire(), &belief, true).expect("fits");
     assert!(!prediction.has_cavities() && prediction.to_bytes().is_empty());
-    prediction.predict(&mut with);
-    let mut prediction = Prediction::known(&model, &plain, false).expect("fits");
-    prediction.predict(&mut plain);
-    assert_eq!(with, plain);
     assert!(prediction.restore(&[]) && !prediction.restore(&[0; 4]));
 }
 
@@ -289,40 +250,13 @@ fn unseen_cells_and_cavities_keep_summing_to_one() {
     ] {
         let mut belief = belief(3, shape(3, 35));
         let mut prediction = Prediction::known(&model, &belief, true).expect("fits");
-        for _ in 0..2_000 {
+        for _ in 0..5_000 {
             prediction.predict(&mut belief);
         }
+        assert!(prediction.has_cavities());
         let bytes = [belief.to_bytes(), prediction.to_bytes()].concat();
-        let numbers: Vec<f32> = bytes
-            .as_chunks()
-            .0
-            .iter()
-            .map(|it| f32::from_le_bytes(*it))
-            .collect();
-        let beliefs =
-            ArrayView::from_shape((numbers.len() / 315, 3, 105), &numbers).expect("planes");
-        assert!(beliefs.len_of(Axis(0)) > 1 && prediction.has_cavities());
-        for sum in beliefs.sum_axis(Axis(1)) {
-            assert!((sum - 1.0).abs() < 3e-5, "{sum}");
-        }
-    }
-}
-
-#[test]
-fn a_correction_changes_only_the_cavities_of_its_cells() {
-    let states = Grid::from_shape_vec((1, 5), vec![1, 0, 0, 0, 0]).expect("a grid");
-    let mut belief = Belief::from_states(&states, 3).expect("states");
-    let mut prediction = Prediction::known(&model(FIRE), &belief, true).expect("fits");
-    prediction.predict(&mut belief);
-    let cavities = prediction.to_bytes();
-    let (before, mut after) = (belief.as_slice().to_vec(), belief.as_slice().to_vec());
-    (0..3).for_each(|state| after[state * 5] = [0.1, 0.8, 0.1][state]);
-    prediction.correct(&before, &after);
-    let corrected = prediction.to_bytes();
-    assert_ne!(corrected, cavities);
-    let cells = corrected.chunks(4).zip(cavities.chunks(4)).enumerate();
-    for (index, (after, before)) in cells {
-        assert!(index % 5 == 0 || after == before, "{index}");
+        let mut beliefs = bytes.chunks(4 * 3 * 3 * 35);
+        assert!(beliefs.all(|bytes| Belief::from_bytes(bytes, (3, 3, 35)).is_some()));
     }
 }
 
@@ -336,20 +270,14 @@ fn only_valid_cavities_are_restored() {
     let (bytes, unchanged) = (first.to_bytes(), second.to_bytes());
     // Four cavities per cell, each with three `f32`.
     assert_eq!(bytes.len(), 4 * 4 * 3 * 3 * 35);
-    let with = |number: usize, p: f32| {
-        let mut bytes = bytes.clone();
-        bytes[4 * number..][..4].copy_from_slice(&p.to_le_bytes());
-        bytes
-    };
-    let last = bytes.len() / 4 - 1;
+    let mut negative = bytes.clone();
+    *negative.last_mut().expect("a number") |= 0x80;
     for (name, refused) in [
         ("nothing", Vec::new()),
         ("a value too few", bytes[4..].to_vec()),
         ("a byte too many", [&bytes[..], &[0]].concat()),
         ("zeros", vec![0; bytes.len()]),
-        ("a sum above 1", with(0, 1.0005)),
-        ("a negative number", with(last, -0.5)),
-        ("not a number", with(last, f32::NAN)),
+        ("a negative number", negative),
     ] {
         assert!(!second.restore(&refused), "{name}");
         assert_eq!(second.to_bytes(), unchanged, "{name}");
