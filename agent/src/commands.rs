@@ -19,7 +19,6 @@ use crate::client::errors::refusal;
 use emberwatch_protocol::message::Status;
 use std::process::ExitCode;
 
-/// Exit code of a run whose lease was lost.
 const LEASE_LOST: u8 = 3;
 
 /// Returns the exit code for an error. A lost lease has a separate code, so that callers can recognise it.

@@ -31,7 +31,6 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Minimum time between two checkpoints during training.
 const SAVE_INTERVAL: Duration = Duration::from_secs(30);
 
 const REPORT_INTERVAL: Duration = Duration::from_secs(5);
@@ -48,8 +47,7 @@ pub struct TrainSummary {
     pub reward: f64,
 }
 
-/// Trains until the steps are done or `stop` is set. Always saves at the end.
-/// `contents` is the result of [`TrainingSpec::check`].
+/// Trains until the steps are done or `stop` is set, then saves. `contents`: of [`TrainingSpec::check`].
 pub fn train(
     worlds: &mut Worlds,
     spec: &TrainingSpec,
@@ -80,15 +78,12 @@ struct TrainingLoop<'a> {
     stopwatch: Stopwatch,
     feed: Feed,
     summary: TrainSummary,
-    /// Number of updates of the earlier runs that this run resumes.
     n_before: u64,
     saved: Instant,
     reported: Reported,
-    /// The lock of the training's folder, held until the training ends.
     _lock: File,
 }
 
-/// Totals at the last progress report, and the score since then.
 struct Reported {
     at: Instant,
     steps: u64,
@@ -173,7 +168,6 @@ impl<'a> TrainingLoop<'a> {
         Ok(())
     }
 
-    /// Steps each robot once. Worlds whose episode has ended start their next episode.
     fn step(&mut self) -> Result<Tick> {
         let shows_all = self.learner.wants_full_frames();
         let learner = &mut *self.learner;
@@ -192,7 +186,6 @@ impl<'a> TrainingLoop<'a> {
         Ok(tick)
     }
 
-    /// Writes the metrics and the checkpoint.
     fn save(&mut self, spec: &TrainingSpec) -> Result<()> {
         self.saved = Instant::now();
         let contents = self.learner.contents();
@@ -205,7 +198,6 @@ impl<'a> TrainingLoop<'a> {
         self.metrics.flush()
     }
 
-    /// Warns if the run made no update.
     fn warn_of_no_update(&self) {
         let steps = self.summary.steps;
         if steps > 0 && self.learner.n_updates() == self.n_before {
@@ -248,7 +240,6 @@ impl Reported {
     }
 }
 
-/// Creates the learner of the client's robots. With `contents`, resumes it from a checkpoint.
 fn new_learner(
     spec: &TrainingSpec,
     kind: &LearnerKind,
@@ -282,7 +273,6 @@ fn new_learner(
     }
 }
 
-/// Locks a training's folder until the file is dropped.
 fn lock(folder: &Path) -> Result<File> {
     let file = File::open(folder).with_context(|| format!("--out {}", folder.display()))?;
     // File systems without locks are used without one.
@@ -324,7 +314,6 @@ fn is_over(seen: &Observation) -> bool {
     seen.world.truncated != 0 || seen.world.terminated != 0
 }
 
-/// Returns the worlds whose episodes have ended, according to the observations of the client's robots.
 fn ended<'a>(
     client: &Client<impl Backend>,
     observations: impl Iterator<Item = &'a Observation>,
@@ -338,7 +327,6 @@ fn ended<'a>(
     worlds
 }
 
-/// Starts the next episode of some worlds. Returns the number and first observation of each of their robots.
 fn reset(
     client: &mut Client<impl Backend>,
     worlds: &[u32],
@@ -356,7 +344,6 @@ fn reset(
     Ok(seen)
 }
 
-/// Opens the metrics file.
 fn metrics(spec: &TrainingSpec, kind: &LearnerKind, learner: &dyn Learner) -> Result<Metrics> {
     let (columns, world_steps) = (kind.columns, learner.world_steps());
     let path = spec.out.join(METRICS);

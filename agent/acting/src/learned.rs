@@ -32,7 +32,6 @@ impl WorldNames {
         }
     }
 
-    /// Returns whether names that both sides know differ.
     fn differ(&self, other: &Self) -> bool {
         let models = self.model.as_ref().zip(other.model.as_ref());
         let is_known = !self.observations.is_empty() && !other.observations.is_empty();

@@ -151,8 +151,7 @@ impl OptionAgent {
         &self.agent
     }
 
-    /// Resumes from the belief that another agent handed over. Returns false if the format `kind` or the bytes do not
-    /// fit.
+    /// Resumes from another agent's belief. Returns false if the format `kind` or the bytes do not fit.
     pub fn take_over(&mut self, kind: &str, bytes: &[u8]) -> bool {
         self.agent.handover_kind().is_some_and(|own| own == kind) && self.agent.take_over(bytes)
     }

@@ -54,8 +54,7 @@ pub trait Environment {
     fn step(&mut self, paths: &[Vec<Move>]) -> Result<Option<Vec<AgentObservation>>>;
 }
 
-/// An agent and its world's last observation. The agent plans for one robot, or for several robots that share one
-/// belief.
+/// An agent and its world's last observation. It plans for one robot, or for several that share one belief.
 pub struct ActingAgent {
     pub agent: Agent,
     seen: AgentObservation,
@@ -166,7 +165,6 @@ impl ActingAgent {
     }
 }
 
-/// Several agents, each with its own belief.
 impl Actor for Vec<ActingAgent> {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let plans = in_parallel(self, ActingAgent::plan);

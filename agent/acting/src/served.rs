@@ -9,7 +9,6 @@ use emberwatch_model::Move;
 /// The environment of all robots of a client.
 pub struct Served<'a, B> {
     client: &'a mut Client<B>,
-    /// Whether frames show every cell.
     shows_all: bool,
 }
 
@@ -19,10 +18,7 @@ impl<'a, B: Backend> Served<'a, B> {
         Self { client, shows_all }
     }
 
-    /// Returns the current observation of each agent.
-    ///
-    /// # Errors
-    /// If the backend does not answer.
+    /// Returns the current observation of each agent, or an error if the backend does not answer.
     pub fn observe(&mut self) -> Result<Vec<AgentObservation>> {
         let observations = self.client.observe(self.client.robots())?;
         let seen = observations.into_iter();

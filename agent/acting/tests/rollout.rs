@@ -4,7 +4,6 @@ use emberwatch_acting::beliefs::Conditions;
 use emberwatch_acting::config::AgentConfig;
 use emberwatch_acting::learned::Learned;
 use emberwatch_acting::policy::Policy;
-use emberwatch_acting::rollout::agent::Agent;
 use emberwatch_acting::rollout::building::agent;
 use emberwatch_acting::rollout::{ActingAgent, Actor, AgentObservation};
 use emberwatch_belief::Belief;
@@ -23,18 +22,15 @@ fn seen(step: u64, cells: &[Cell]) -> AgentObservation {
     for cell in (0..72).filter(|cell| split_mix(step, *cell).is_multiple_of(4)) {
         frame.observe(cell as usize, (split_mix(step + 9, cell) % 3) as u8);
     }
-    let world = WorldResult {
-        step,
-        ..WorldResult::default()
-    };
-    AgentObservation::new(cells.iter().map(|cell| Observation {
-        world,
-        robot: RobotResult {
-            row: cell.row as u32,
-            col: cell.col as u32,
-            ..RobotResult::default()
-        },
-        frame: frame.clone(),
+    AgentObservation::new(cells.iter().map(|cell| {
+        let (mut world, mut robot) = (WorldResult::default(), RobotResult::default());
+        (world.step, robot.row, robot.col) = (step, cell.row as u32, cell.col as u32);
+        let frame = frame.clone();
+        Observation {
+            world,
+            robot,
+            frame,
+        }
     }))
 }
 
@@ -82,19 +78,15 @@ fn missed_steps_equal_steps_with_empty_frames() {
 }
 
 #[test]
-fn a_correction_raises_the_score_of_its_frame() {
-    let mut agent = robot("known/beam/exploit", &CELLS[..1]);
-    agent.plan();
-    agent.agent.predict();
+fn a_step_is_scored_before_its_correction() {
+    let mut acting = robot("known/beam/exploit", &CELLS[..1]);
+    acting.plan();
     let seen = seen(1, &CELLS[..1]);
-    let frame = &seen.observation.frame;
-    let score = |agent: &Agent| agent.score(frame).expect("a filter predicts frames");
-    let before = score(&agent.agent);
-    agent.agent.correct(frame, None).expect("possible");
-    let after = score(&agent.agent);
-    assert_eq!(before.n_seen, frame.observed().count() as u64);
-    assert!(before.log_likelihood < after.log_likelihood);
-    assert!(after.log_likelihood < 0.0);
+    let expected = acting.agent.score(&seen.observation.frame);
+    let got = acting.see(seen.clone()).expect("possible").score;
+    assert!(got.is_some() && got == expected);
+    let after = acting.agent.score(&seen.observation.frame);
+    assert!(after.expect("a filter").log_likelihood > got.expect("a score").log_likelihood);
 }
 
 #[test]

@@ -40,7 +40,6 @@ fn advance(estimator: &mut dyn Estimator, frame: &Frame) {
     estimator.predict();
 }
 
-/// Creates a frame with observations 0 to 2 along a random walk from the centre.
 fn frame(step: u64) -> Frame {
     let bits = |t: u64| split_mix(step, t) >> 62;
     let moves: Vec<Move> = (0..512).map(|t| Move::from_low_bits(bits(t))).collect();
@@ -120,7 +119,6 @@ fn estimators(c: &mut Criterion) {
     c.bench_function("entropy", |b| b.iter(|| filter.belief().entropy()));
 }
 
-/// The prediction by hazards, without and with cavities.
 fn predictions(c: &mut Criterion) {
     for name in [
         "wildfire-burnout",

@@ -34,8 +34,7 @@ pub fn log_loss(belief: &Belief, truth: &Grid<u8>) -> f64 {
     0.0 - sum / truth.len() as f64
 }
 
-/// Computes the fraction of cells whose most probable state is the true state. If several states are equally probable,
-/// the first one counts.
+/// Computes the fraction of cells whose most probable state, the first if several are equal, is the true state.
 pub fn accuracy(belief: &Belief, truth: &Grid<u8>) -> f64 {
     let numbers = belief.as_slice();
     let is_right = |&(index, &state): &(usize, &u8)| {

@@ -43,7 +43,6 @@ pub struct MeritTally {
     /// The step of the last visit to each cell, row-major. 0 if the cell was never visited.
     last_visits: Vec<u32>,
     n_seen: usize,
-    /// The step of the first detection, and the number of burning cells at that step.
     detection: Option<(u32, u32)>,
     burning_seen: Mean,
     distance: Mean,
@@ -97,7 +96,6 @@ impl MeritTally {
         }
     }
 
-    /// Updates the figures that need the hidden states.
     fn watch(&mut self, flights: &[Flight], states: &Grid<u8>) {
         let states = states.as_slice().expect("invariant: grids are row-major");
         let forgotten = self.step.saturating_sub(RECENT_STEPS);
@@ -135,8 +133,7 @@ impl Mean {
     }
 }
 
-/// Returns the number of moves from a cell to the nearest cell that satisfies `is_one`, or `best` if no such cell is
-/// nearer. Scans row by row, from the nearest rows outwards.
+/// Returns the moves to the nearest cell that satisfies `is_one`, or `best` if none is nearer.
 fn nearest(shape: Shape, from: Cell, mut best: usize, is_one: impl Fn(usize) -> bool) -> usize {
     let (height, width) = shape.dim();
     for row_moves in 0..height {
@@ -161,8 +158,12 @@ fn nearest(shape: Shape, from: Cell, mut best: usize, is_one: impl Fn(usize) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::BTreeSet;
 
     const FIRE: u8 = 2;
+
+    /// For each step, the world and the cells that each robot visits.
+    type Steps<'a> = [(&'a str, &'a [&'a [usize]])];
 
     /// Creates a world of one row, in which `#` burns.
     fn world(row: &str) -> Grid<u8> {
@@ -170,25 +171,18 @@ mod tests {
         Grid::from_shape_vec((1, row.len()), states.collect()).expect("test world")
     }
 
-    fn flight(visited: &[usize]) -> Flight {
-        let col = *visited.last().expect("a cell");
-        Flight {
-            visited: visited.to_vec(),
-            end: Cell { row: 0, col },
-        }
-    }
-
-    /// Computes the figures of a run. Each step consists of the world and the cells that each robot visits.
-    fn merit(steps: &[(&str, &[&[usize]])]) -> Merit {
+    fn merit(steps: &Steps<'_>) -> Merit {
         let shape = Shape::new(1, steps[0].0.len()).expect("test shape");
         let mut tally = MeritTally::new(shape, FIRE);
         for (row, robots) in steps {
-            let flights: Vec<Flight> = robots.iter().map(|visited| flight(visited)).collect();
+            let flight = |visited: &&[usize]| Flight {
+                visited: visited.to_vec(),
+                end: shape.cell(*visited.last().expect("a cell")),
+            };
+            let flights: Vec<Flight> = robots.iter().map(flight).collect();
             let states = world(row);
             let burns = |cell: &usize| states[[0, *cell]] == FIRE;
-            let mut visited = robots.concat();
-            visited.sort_unstable();
-            visited.dedup();
+            let visited: BTreeSet<usize> = robots.concat().into_iter().collect();
             let found = Found {
                 n_hits: visited.iter().filter(|cell| burns(cell)).count() as u32,
                 n_burning: (0..row.len()).filter(burns).count() as u32,
@@ -200,64 +194,55 @@ mod tests {
 
     #[test]
     fn detection_is_the_first_visit_to_a_burning_cell() {
-        let of = |it: Merit| (it.steps_to_detection, it.burning_cells_at_detection);
         // Cell 1 is visited before it burns, then missed. Cell 2 is found when two cells burn.
-        let steps: [(&str, &[&[usize]]); 3] =
-            [("....", &[&[0, 1]]), (".#..", &[&[2]]), (".##.", &[&[2]])];
-        assert_eq!(of(merit(&steps)), (Some(3), Some(2)));
         // Later detections do not count.
-        let got = merit(&[("#...", &[&[0]]), ("####", &[&[1]])]);
-        assert_eq!(of(got), (Some(1), Some(1)));
-        let got = merit(&[("...#", &[&[0]]), ("...#", &[&[1]])]);
-        assert_eq!((of(got), got.burning_seen_share), ((None, None), Some(0.0)));
-        // The distance is 3 moves in one step and 2 in the other.
-        assert_eq!(got.front_distance, Some(2.5));
+        let worlds: [&Steps<'_>; 4] = [
+            &[("....", &[&[0, 1]]), (".#..", &[&[2]]), (".##.", &[&[2]])],
+            &[("#...", &[&[0]]), ("####", &[&[1]])],
+            &[("...#", &[&[0]]), ("...#", &[&[1]])],
+            &[("#....#.#", &[&[0, 1], &[4, 5]])],
+        ];
+        let got = worlds
+            .map(merit)
+            .map(|it| it.steps_to_detection.zip(it.burning_cells_at_detection));
+        assert_eq!(got, [Some((3, 2)), Some((1, 1)), None, Some((1, 3))]);
     }
 
     #[test]
-    fn a_world_without_fire_has_no_share_and_no_front() {
-        let got = merit(&[("....", &[&[0]]), ("....", &[&[1, 2]])]);
-        let expected = Merit {
-            steps_to_detection: None,
-            burning_cells_at_detection: None,
-            burning_seen_share: None,
-            front_distance: None,
-            grid_seen_share: 0.75,
-        };
-        assert_eq!(got, expected);
-        // Steps without fire do not count. In the other step, half of the fire is seen.
-        let got = merit(&[("....", &[&[0]]), ("#..#", &[&[1]])]);
-        assert_eq!(got.burning_seen_share, Some(0.5));
-        // If all fire is seen, there is no front.
-        let got = merit(&[("##..", &[&[1, 0]]), ("##..", &[&[2, 3]])]);
-        assert_eq!(got.burning_seen_share, Some(1.0));
-        assert_eq!((got.front_distance, got.grid_seen_share), (None, 1.0));
-    }
-
-    #[test]
-    fn only_recent_visits_count_as_seen() {
+    fn recent_visits_of_all_robots_count_as_seen() {
         // Cell 0 counts as seen in steps 1 to 10, with the nearest unseen fire 3 moves away in the first, then 2. In the
         // steps after these, cell 0 is unseen fire, 1 move away.
-        let mut steps: Vec<(&str, &[&[usize]])> = vec![("#..#", &[&[1]]); 12];
-        steps[0].1 = &[&[0]];
-        let got = merit(&steps);
-        assert_eq!(got.burning_seen_share, Some(0.5 * 10.0 / 12.0));
-        assert_eq!(got.front_distance, Some((3.0 + 9.0 * 2.0 + 2.0) / 12.0));
-        assert_eq!(got.grid_seen_share, 0.5);
-    }
-
-    #[test]
-    fn visits_of_all_robots_count_together() {
-        let got = merit(&[("#....#.#", &[&[0, 1], &[4, 5]])]);
-        let expected = Merit {
-            steps_to_detection: Some(1),
-            burning_cells_at_detection: Some(3),
-            burning_seen_share: Some(2.0 / 3.0),
-            // Measured from cell 5 to cell 7, not from cell 1.
-            front_distance: Some(2.0),
-            grid_seen_share: 0.5,
-        };
-        assert_eq!(got, expected);
+        let mut long: Vec<(&str, &[&[usize]])> = vec![("#..#", &[&[1]]); 12];
+        long[0].1 = &[&[0]];
+        let front = (3.0 + 9.0 * 2.0 + 2.0) / 12.0;
+        let worlds: [&Steps<'_>; 6] = [
+            &long,
+            &[("...#", &[&[0]]), ("...#", &[&[1]])],
+            &[("....", &[&[0]]), ("....", &[&[1, 2]])],
+            &[("....", &[&[0]]), ("#..#", &[&[1]])],
+            &[("##..", &[&[1, 0]]), ("##..", &[&[2, 3]])],
+            &[("#....#.#", &[&[0, 1], &[4, 5]])],
+        ];
+        for (steps, expected) in worlds.into_iter().zip([
+            (Some(0.5 * 10.0 / 12.0), Some(front), 0.5),
+            // The front is 3 moves away in one step and 2 in the other.
+            (Some(0.0), Some(2.5), 0.5),
+            // Without fire there is no share. Steps without fire do not count.
+            (None, None, 0.75),
+            (Some(0.5), Some(2.0), 0.5),
+            // If all fire is seen, there is no front.
+            (Some(1.0), None, 1.0),
+            // The front is measured from cell 5 to cell 7, not from cell 1.
+            (Some(2.0 / 3.0), Some(2.0), 0.5),
+        ]) {
+            let got = merit(steps);
+            let got = (
+                got.burning_seen_share,
+                got.front_distance,
+                got.grid_seen_share,
+            );
+            assert_eq!(got, expected, "{steps:?}");
+        }
     }
 
     #[test]

@@ -7,12 +7,6 @@
 //! for name in "a3_bayes", "a4_masked_small", "a5_planner":
 //!     z = np.load(f"golden/{name}.npz")
 //!     np.savez(f"{name}.npz", **{k: z[k] for k in z.files if z[k].dtype.kind != "U"})
-//! # Two of the reference's six steps at full size.
-//! z = np.load("golden/a4_masked_step.npz")
-//! u, mask, p = np.stack([z["u0"], z["u_next"][0]]), z["mask"][:2], z["state_est"][:2]
-//! assert (p == u)[mask == 0].all()
-//! np.savez("a4_masked_filter.npz", W=z["W_obs_param"], u=u, obs=z["obs"][:2], mask=mask,
-//!          posterior_at_mask=p[mask > 0])
 //! ```
 
 #[path = "../../network/tests/network/golden_file.rs"]
@@ -21,9 +15,9 @@ mod golden_file;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_belief::planning::{Integration, Objective, Target};
+use emberwatch_model::Model;
 use emberwatch_model::grid::{Cell, Shape};
 use emberwatch_model::path::Move;
-use emberwatch_model::{Frame, Model};
 use golden_file::{Golden, frame_from};
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, Axis};
 
@@ -74,72 +68,29 @@ fn the_filter_reproduces_posterior_and_predictor() {
     }
 }
 
-/// Checks a posterior against Bayes' rule on visited cells only, with the likelihood that the reference's network
-/// learned. `weights` has shape `[O, S]`, and the softmax is over observations.
-fn check_masked(
-    weights: &Array2<f32>,
-    prior: ArrayView3<'_, f32>,
-    frame: &Frame,
-    posterior: ArrayView3<'_, f32>,
-    what: &str,
-) {
-    let mut file = Model::wildfire().file().clone();
-    for (state, column) in file.states.iter_mut().zip(weights.columns()) {
-        let exponentials = column.mapv(|w| f64::from(w).exp());
-        state.observed_as = (&exponentials / exponentials.sum()).to_vec();
-    }
-    let model = Model::new(file).expect("a softmax is a distribution");
-    let mut filter = BayesFilter::known(&model, belief_from(prior), false).expect("valid model");
-    filter.correct(frame).expect("possible frame");
-    assert_close(filter.belief(), posterior, what);
-}
-
-/// Case A4 without the network.
+/// Case A4 without the network: Bayes' rule on visited cells only, with the likelihood that the reference's network
+/// learned. Its weights have shape `[O, S]`, and the softmax is over observations.
 #[test]
 fn the_masked_posterior_agrees() {
     let mut golden = Golden::open("a4_masked_small");
     for case in ["3x3", "4x6"] {
-        let weights = golden.get(&format!("{case}_W"));
+        let weights: Array2<f32> = golden.get(&format!("{case}_W"));
         let prior: Array3<f32> = golden.get(&format!("{case}_u"));
         let observations: Array2<u8> = golden.get(&format!("{case}_obs"));
         let mask: Array2<u8> = golden.get(&format!("{case}_mask"));
         let posterior: Array3<f32> = golden.get(&format!("{case}_state_est"));
-        let frame = frame_from(observations.view(), mask.view());
-        check_masked(&weights, prior.view(), &frame, posterior.view(), case);
-    }
-}
-
-/// Case A4 at full size, along a path of two steps.
-#[test]
-fn the_masked_posterior_agrees_along_a_path() {
-    let mut golden = Golden::open("a4_masked_filter");
-    let weights = golden.get("W");
-    let priors: Array4<f32> = golden.get("u");
-    let observations: Array3<u8> = golden.get("obs");
-    let masks: Array3<u8> = golden.get("mask");
-    let at_mask: Array2<f32> = golden.get("posterior_at_mask");
-    let mut visited = at_mask.rows().into_iter();
-    for step in 0..2 {
-        let at = Axis(0);
-        let (prior, mask) = (priors.index_axis(at, step), masks.index_axis(at, step));
-        let mut posterior = prior.to_owned();
-        for ((row, col), _) in mask.indexed_iter().filter(|&(_, &seen)| seen > 0) {
-            let cell = visited.next().expect("one row per visited cell");
-            posterior
-                .index_axis_mut(at, row)
-                .index_axis_mut(at, col)
-                .assign(&cell);
+        let mut file = Model::wildfire().file().clone();
+        for (state, column) in file.states.iter_mut().zip(weights.columns()) {
+            let exponentials = column.mapv(|w| f64::from(w).exp());
+            state.observed_as = (&exponentials / exponentials.sum()).to_vec();
         }
-        let frame = frame_from(observations.index_axis(at, step), mask);
-        check_masked(
-            &weights,
-            prior,
-            &frame,
-            posterior.view(),
-            &format!("step {step}"),
-        );
+        let model = Model::new(file).expect("a softmax is a distribution");
+        let prior = belief_from(prior.view());
+        let mut filter = BayesFilter::known(&model, prior, false).expect("valid model");
+        let frame = frame_from(observations.view(), mask.view());
+        filter.correct(&frame).expect("possible frame");
+        assert_close(filter.belief(), posterior.view(), case);
     }
-    assert!(visited.next().is_none());
 }
 
 /// Returns the objective for an action of one of the reference's planner types. The last action stands for entropy.

@@ -10,7 +10,6 @@ use std::ops::Range;
 /// Number of planes computed at once. Together with [`WIDE`] vectors of cells per plane, they fill the SIMD registers.
 const GROUP: usize = 3;
 
-/// Number of vectors of cells computed at once.
 const WIDE: usize = 4;
 
 /// A convolution from planes to planes: `to[m] = sum_n sum_a w[m, n, a] from[n, . + a]`.
@@ -40,7 +39,6 @@ impl Convolution {
         Self::new(self.layout, turned)
     }
 
-    /// Computes one row of the grid.
     #[inline(always)]
     pub(crate) fn row<S: Simd>(&self, simd: S, from: &[f32], to: &mut [f32], row: usize) {
         let n_to = self.layout.n_states;
@@ -53,7 +51,6 @@ impl Convolution {
         }
     }
 
-    /// Computes a row for `G` planes, starting with plane `first`.
     #[inline(always)]
     fn group<S: Simd, const G: usize>(
         &self,
@@ -75,7 +72,6 @@ impl Convolution {
         }
     }
 
-    /// Computes `B` vectors of cells for `G` planes.
     #[inline(always)]
     fn block<S: Simd, const G: usize, const B: usize>(
         &self,
@@ -117,8 +113,7 @@ impl Convolution {
         }
     }
 
-    /// Adds the derivatives with respect to the weights to `gradient`. `h` contains the derivatives with respect to the
-    /// result, which are zero outside `region`.
+    /// `h` contains the derivatives with respect to the result, which are zero outside `region`.
     #[inline(always)]
     pub(crate) fn add_weight_gradient<S: Simd>(
         &self,
@@ -143,7 +138,6 @@ impl Convolution {
         }
     }
 
-    /// Adds the gradient of one kernel row, from one plane to `G` planes, three weights at a time.
     #[inline(always)]
     fn taps<S: Simd, const G: usize>(
         &self,
@@ -170,7 +164,6 @@ impl Convolution {
         }
     }
 
-    /// Adds the gradient of `C` weights in a kernel row, starting with weight `first`.
     #[inline(always)]
     fn some_taps<S: Simd, const G: usize, const C: usize>(
         &self,
@@ -223,7 +216,6 @@ impl Region {
         self.cols = widened(&self.cols, col..col + LANES);
     }
 
-    /// Returns the region that the kernel reaches from this region.
     pub(crate) fn reached(&self, layout: &Layout) -> Self {
         if self.rows.is_empty() {
             return Self::default();
@@ -239,7 +231,6 @@ impl Region {
         }
     }
 
-    /// Returns the index of each of the region's SIMD vectors in a row.
     #[inline(always)]
     pub(crate) fn places<S: Simd>(
         &self,

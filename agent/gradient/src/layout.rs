@@ -14,13 +14,9 @@ pub(crate) struct Layout {
     pub(crate) n_states: usize,
     pub(crate) kernel_height: usize,
     pub(crate) kernel_width: usize,
-    /// Rows of margin above the grid.
     pub(crate) above: usize,
-    /// Columns of margin to the left of the grid.
     pub(crate) left: usize,
-    /// Offset from one row to the next.
     pub(crate) stride: usize,
-    /// Offset from one state to the next.
     pub(crate) plane: usize,
 }
 
@@ -41,12 +37,10 @@ impl Layout {
         }
     }
 
-    /// Returns the number of weights of the kernel between two states.
     pub(crate) fn n_taps(&self) -> usize {
         self.kernel_height * self.kernel_width
     }
 
-    /// Allocates planes of zeros, one per state.
     pub(crate) fn planes(&self) -> Vec<f32> {
         vec![0.0; self.n_states * self.plane]
     }
@@ -56,23 +50,19 @@ impl Layout {
         self.shape.width().next_multiple_of(LANES)
     }
 
-    /// Returns the index of a row's first cell in the first state's plane.
     pub(crate) fn row(&self, row: usize) -> usize {
         (row + self.above) * self.stride + self.left
     }
 
-    /// Returns the index of a cell in the first state's plane.
     pub(crate) fn place(&self, cell: usize) -> usize {
         self.row(cell / self.shape.width()) + cell % self.shape.width()
     }
 
-    /// Returns 1 for each column of the grid, and 0 for each further computed column.
     pub(crate) fn mask(&self) -> Vec<f32> {
         let on_grid = |col| f32::from(u8::from(col < self.shape.width()));
         (0..self.columns()).map(on_grid).collect()
     }
 
-    /// Copies a belief `[S, H, W]` into the planes, inside the margins.
     pub(crate) fn load(&self, from: &[f32], to: &mut [f32]) {
         let states = from.chunks_exact(self.shape.n_cells());
         for (cells, plane) in states.zip(to.chunks_exact_mut(self.plane)) {
@@ -82,7 +72,6 @@ impl Layout {
         }
     }
 
-    /// Copies the planes into a belief `[S, H, W]`, the reverse of [`Self::load`].
     pub(crate) fn unload(&self, from: &[f32], to: &mut [f32]) {
         let states = to.chunks_exact_mut(self.shape.n_cells());
         for (cells, plane) in states.zip(from.chunks_exact(self.plane)) {

@@ -39,7 +39,6 @@ impl Operator {
         }
     }
 
-    /// Computes `h` from `g` in a region.
     #[inline(always)]
     pub(crate) fn backward_normalise<S: Simd>(
         &self,
@@ -56,7 +55,6 @@ impl Operator {
         }
     }
 
-    /// Adds `dL/dw` for a region of `h` to `gradient`.
     #[inline(always)]
     pub(crate) fn add_weight_gradient<S: Simd>(
         &self,
@@ -70,7 +68,6 @@ impl Operator {
             .add_weight_gradient(simd, p, h, region, gradient);
     }
 
-    /// Computes `dL/dp` in some rows, from `h`.
     #[inline(always)]
     pub(crate) fn backward_correlate<S: Simd>(
         &self,
@@ -98,7 +95,6 @@ impl Operator {
         }
     }
 
-    /// Computes `h` for one vector of cells, by backpropagation through [`Self::normalise`].
     #[inline(always)]
     fn unnormalise<S: Simd>(
         &self,
@@ -121,7 +117,6 @@ impl Operator {
         }
     }
 
-    /// Returns `1 / sum_m v`, or 0 outside of the grid.
     #[inline(always)]
     fn factor<S: Simd>(&self, simd: S, v: &[f32], at: usize, col: usize) -> S::f32s {
         let mask = load::<S>(&self.mask, col);

@@ -213,7 +213,6 @@ impl Recursion {
         reached
     }
 
-    /// Adds the gradient with respect to the first belief, which all cells share.
     fn add_initial_gradient(&self, outcome: &mut Outcome) {
         let layout = self.operator.layout;
         for row in 0..layout.shape.height() {
@@ -226,7 +225,6 @@ impl Recursion {
     }
 }
 
-/// The arguments of a call of [`Recursion::run`].
 struct Pass<'a> {
     recursion: &'a mut Recursion,
     start: Option<&'a [f32]>,

@@ -26,7 +26,6 @@ fn parameters() -> Parameters {
     Parameters::first(dimensions, 0)
 }
 
-/// A replay buffer with frames of random walks, or of straight flights, in a made-up world.
 fn replay(is_straight: bool) -> BlockReplay {
     let mut replay = BlockReplay::new(64, 64 * 64);
     replay.start_track(0);

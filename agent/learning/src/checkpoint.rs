@@ -24,24 +24,19 @@ use std::io::Read;
 use std::path::Path;
 use thiserror::Error;
 
-/// Keys of the metadata.
 const KIND: &str = "emberwatch.kind";
 const FORMAT: &str = "emberwatch.format";
 const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
 const WORLDS: &str = "worlds";
 
-/// Name of the byte tensor.
 const STATE: &str = "state";
 
-/// Encoding of the state: integers have a fixed size.
 const FORM: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
-/// The format of all checkpoints.
 const VERSION: &str = "6";
 
-/// Maximum size of a checkpoint in bytes.
 const MAX_BYTES: u64 = 1 << 32;
 
 /// Maximum memory for a decoded state in bytes, so that a small file cannot exhaust memory.
@@ -105,10 +100,7 @@ impl Contents {
         Ok(state)
     }
 
-    /// Returns the values of a tensor.
-    ///
-    /// # Errors
-    /// If the tensor is missing, has a different shape, or contains non-finite values.
+    /// Returns a tensor's values, or an error if it is missing, has another shape, or is not finite.
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         let tensor = self.tensors.get(name);
         let tensor = tensor.with_context(|| {
@@ -148,7 +140,6 @@ impl Contents {
         config.map_err(|error| wrong(SETTINGS, "the settings of an agent", error))
     }
 
-    /// Returns the worlds as JSON, or nothing if they are unknown.
     fn worlds_text(&self) -> String {
         if self.worlds == WorldNames::default() {
             return String::new();
@@ -193,10 +184,7 @@ impl Part<'_> {
     }
 }
 
-/// Writes a checkpoint for a kind of learner, completely or not at all.
-///
-/// # Errors
-/// If the system reports an error. An existing file then remains unchanged.
+/// Writes a checkpoint of a kind of learner. After an error, an existing file is unchanged.
 pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
     let bytes = encode(kind, contents).with_context(|| named(path))?;
     replace_file(path, &bytes).with_context(|| named(path))

@@ -38,7 +38,6 @@ pub fn check_replaceable(path: &Path) -> Result<()> {
     checked.with_context(|| format!("write {}", path.display()))
 }
 
-/// Follows symbolic links.
 fn target(path: &Path) -> PathBuf {
     std::fs::canonicalize(path).unwrap_or_else(|_| path.into())
 }

@@ -11,7 +11,6 @@ use emberwatch_model::MAX_VALUES;
 use emberwatch_network::{Device, NamedTensor, NetworkError, NeuralBelief};
 use serde::{Deserialize, Serialize};
 
-/// Prefix of the names of the corrected filter's tensors.
 const FILTER: &str = "filter.";
 
 /// The part of a [`LearnedModel`] that a checkpoint stores besides the tensors.
@@ -51,7 +50,6 @@ impl SavedModel {
 pub struct SavedNeuralModel {
     n_observations: usize,
     target: usize,
-    /// The filter whose prediction the network corrects.
     filter: Option<Box<SavedModel>>,
 }
 
@@ -118,9 +116,6 @@ pub fn filter_tensors(model: &LearnedModel) -> [NamedTensor; 3] {
 }
 
 /// Returns the parameters of a network, and of the filter that it corrects, as named tensors.
-///
-/// # Errors
-/// If the network's device fails.
 pub fn neural_tensors(model: &NeuralModel) -> Result<Vec<NamedTensor>, NetworkError> {
     let filter = model.filter.as_deref().map(corrected_tensors);
     let parameters = model.network.parameters()?.into_iter();
@@ -133,7 +128,6 @@ pub fn corrected_tensors(filter: &LearnedModel) -> impl Iterator<Item = NamedTen
     filter_tensors(filter).into_iter().map(named)
 }
 
-/// Checks that the target is the index of a state.
 fn check_target(target: usize, n_states: usize) -> Result<()> {
     let expected = format!("less than {n_states}");
     check(target < n_states, "target", expected, target)

@@ -16,7 +16,6 @@ pub struct Block {
     pub frames: Vec<Vec<Sighting>>,
     /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
     pub start: Option<Vec<f32>>,
-    /// The number of the track's next block.
     next: u64,
 }
 
@@ -25,7 +24,6 @@ pub struct BlockReplay {
     block_length: usize,
     max_frames: usize,
     full: BTreeMap<u64, Block>,
-    /// The block that receives new frames, for each robot.
     open: BTreeMap<u32, (u64, Block)>,
     n_opened: u64,
 }
@@ -159,26 +157,22 @@ mod tests {
         }
     }
 
-    fn numbers(replay: &BlockReplay) -> Vec<u64> {
-        replay.blocks().collect()
-    }
-
     #[test]
     fn frames_are_stored_in_blocks_until_the_buffer_is_full() {
         let three = replay(3);
-        assert_eq!(numbers(&three), [0, 1]);
+        assert!(three.blocks().eq([0, 1]));
         let block = three.block(1).expect("kept");
         let seen = |value| vec![Sighting { cell: 1, value }];
         assert_eq!(block.frames, [seen(0), seen(1)]);
         assert_eq!(block.start, None);
         assert_eq!(three.block(2), None, "not full");
-        assert_eq!(numbers(&replay(6)), [3, 4, 5]);
+        assert!(replay(6).blocks().eq([3, 4, 5]));
         let mut short = BlockReplay::new(2, 7);
         for _ in 0..9 {
             short.start_track(0);
             short.push(0, &frame(1), None);
         }
-        assert_eq!(numbers(&short), [1, 2, 3, 4, 5, 6, 7]);
+        assert!(short.blocks().eq(1..8));
     }
 
     #[test]
@@ -206,13 +200,8 @@ mod tests {
             let start = block.start.as_deref().map(|start| start[0]);
             (number, block.frames.len(), start)
         });
-        let expected = [
-            (0, 2, None),
-            (1, 2, None),
-            (2, 1, Some(0.125)),
-            (4, 2, None),
-        ];
-        assert_eq!(kept.collect::<Vec<_>>(), expected);
+        let full = |number| (number, 2, None);
+        assert!(kept.eq([full(0), full(1), (2, 1, Some(0.125)), full(4)]));
         replay.hand_on(2, &[8.0]); // There is no next block.
         replay.start_track(0);
         replay.start_track(0);

@@ -28,7 +28,6 @@ fn shape() -> Shape {
     Shape::new(64, 64).expect("valid shape")
 }
 
-/// Returns the frame of a random walk of 64 moves: about 33 cells, whose observations form patches of equal values.
 fn path_frame(step: u64) -> Frame {
     let moves: Vec<Move> = (0..64)
         .map(|t| Move::from_low_bits(split_mix(step, t) >> 62))
@@ -126,7 +125,6 @@ fn dqn(c: &mut Criterion) {
     });
 }
 
-/// Returns the frame of a flight of 32 moves along a row and 32 along a column.
 fn flight_frame(step: u64) -> Frame {
     let directions = match step % 4 {
         0 => [Move::Right, Move::Down],

@@ -10,7 +10,6 @@ use candle_nn::{Init, VarBuilder};
 /// Weight of a new window in the moving averages of the running statistics, as in PyTorch.
 const MOMENTUM: f64 = 0.1;
 
-/// The parameters and running statistics of one normalisation.
 #[derive(Debug)]
 pub(crate) struct BatchNorm {
     name: String,
@@ -32,13 +31,11 @@ impl BatchNorm {
         })
     }
 
-    /// Returns gamma and beta, for our operators.
     pub(crate) fn weights(&self) -> [&Tensor; 2] {
         [&self.gamma, &self.beta]
     }
 
-    /// Returns the moments to normalise with. In training, these are the moments of the window, which are also stored
-    /// in the pass.
+    /// In training, these are the moments of the window, which are also stored in the pass.
     pub(crate) fn moments(&self, pass: &Pass<'_>, of_window: Moments) -> Result<Moments> {
         if !pass.trains() {
             return Ok(Moments {
@@ -55,7 +52,6 @@ impl BatchNorm {
         Ok(of_window)
     }
 
-    /// Normalises `u [frames, channels, rows, cols]` with candle's operators.
     pub(crate) fn forward(&self, u: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let channels = u.dim(1)?;
         let per_channel = |tensor: &Tensor| tensor.reshape((1, channels, 1, 1));
@@ -81,7 +77,6 @@ fn exact(tensor: &Tensor) -> Result<Vec<f64>> {
     tensor.flatten_all()?.to_dtype(DType::F64)?.to_vec1()
 }
 
-/// Computes the new running statistics after a window.
 pub(crate) fn moved_statistics(
     variables: &Variables,
     moments: &[KeptMoments],

@@ -7,8 +7,7 @@ use emberwatch_model::grid::Shape;
 /// the predictions.
 const MARGINS: usize = 24;
 
-/// A rectangular part of a grid, with sides that are multiples of [`ALIGNMENT`]. It may extend beyond the grid's lower
-/// and right edges.
+/// A rectangular part of a grid, with sides that are multiples of [`ALIGNMENT`], which may extend beyond the grid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Crop {
     /// Row and column of the upper left cell.
@@ -30,7 +29,6 @@ impl Crop {
         }
     }
 
-    /// Returns the sides of a crop that is large enough for each of the given extents with margins.
     pub(crate) fn sides(shape: Shape, extents: &[Extent]) -> [usize; 2] {
         let whole = Self::whole(shape);
         [0, 1].map(|axis| {
@@ -40,8 +38,7 @@ impl Crop {
         })
     }
 
-    /// Returns the crop with the given side lengths, centred on `extent` up to the alignment. A crop that would leave
-    /// the aligned grid is moved inside.
+    /// A crop that would leave the aligned grid is moved inside.
     pub(crate) fn around(shape: Shape, sides: [usize; 2], extent: &Extent) -> Self {
         let whole = Self::whole(shape);
         let first = [0, 1].map(|axis| {
@@ -55,10 +52,7 @@ impl Crop {
     }
 }
 
-/// Returns the extent of some cells, given by row-major indices.
-///
-/// # Panics
-/// If there are no cells.
+/// Panics if there are no cells.
 pub(crate) fn extent(shape: Shape, cells: impl Iterator<Item = usize>) -> Extent {
     let mut extent = [[usize::MAX, 0]; 2];
     for cell in cells.map(|cell| shape.cell(cell)) {

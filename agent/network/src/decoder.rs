@@ -21,7 +21,6 @@ use candle_nn::VarBuilder;
 const CONVOLUTIONS: [usize; 5] = [0, 4, 8, 12, 16];
 const NORMS: [usize; 4] = [2, 6, 10, 14];
 
-/// Side of the kernels that double the size.
 const KERNEL: usize = 4;
 
 /// The decoder, from hidden vectors to logits of states.
@@ -34,7 +33,6 @@ pub struct Decoder {
     operators: Operators,
 }
 
-/// A normalisation, and the transposed convolution after it.
 #[derive(Debug)]
 struct Level {
     norm: BatchNorm,
@@ -136,7 +134,6 @@ impl Decoder {
         last.kernels.dim(1)
     }
 
-    /// Returns the layers that double the size. `all` is the mask after the last layer, which keeps all channels.
     fn layers<'a>(&'a self, pass: &'a Pass<'_>, all: &'a Mask) -> Result<Vec<Layer<'a>>> {
         let (_, _, mut rows, mut cols) = self.seed.dims4()?;
         let levels = self.levels.iter().enumerate();
@@ -187,7 +184,6 @@ impl Decoder {
     }
 }
 
-/// Returns the number of channels, rows and columns of the last layer's output.
 fn last_map(layers: &[Layer<'_>]) -> [usize; 3] {
     let last = layers.last().expect("invariant: four levels");
     last.conv.sizes.large

@@ -23,8 +23,7 @@ pub struct Mask {
 }
 
 impl Mask {
-    /// Creates a mask that keeps the channels for which `keeps(frame, channel)` is true, and multiplies them by
-    /// `scale`.
+    /// Creates a mask that multiplies the channels with `keeps(frame, channel)` by `scale`, and drops the others.
     pub fn new(
         n_frames: usize,
         channels: usize,

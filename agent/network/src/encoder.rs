@@ -58,8 +58,7 @@ impl Encoder {
         }
     }
 
-    /// Computes the flattened features `[frames, features]` with candle's operators. Feature maps have the shape
-    /// `[frames, channels, rows, cols]`.
+    /// Feature maps have the shape `[frames, channels, rows, cols]`.
     fn stock(&self, pass: &Pass<'_>) -> Result<Tensor> {
         let first = &self.stages[0];
         let (dtype, device) = (first.weight.dtype(), first.weight.device());
@@ -76,8 +75,7 @@ impl Encoder {
         x.flatten_from(1)
     }
 
-    /// Computes the encodings with our operators. The linear layer is computed as a convolution whose kernel covers the
-    /// whole map.
+    /// The linear layer is computed as a convolution whose kernel covers the whole map.
     fn ours(&self, pass: &Pass<'_>) -> Result<Tensor> {
         let (n_frames, encoding) = (pass.window.len(), self.linear.weight().dim(0)?);
         let all = Mask::all(n_frames, encoding);

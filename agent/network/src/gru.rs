@@ -54,7 +54,6 @@ impl Gru {
         }
     }
 
-    /// Computes the sequence on the CPU, with one copy to the CPU and one copy back.
     fn through_the_cpu(&self, inputs: &Tensor, first: &[f32]) -> Result<Tensor> {
         let all = [inputs, &self.w_hh, &self.b_hh];
         let flat = all.map(|tensor| tensor.flatten_all());

@@ -34,7 +34,6 @@ impl Network {
     }
 
     /// Computes the hidden vector after each frame, `[frames, hidden]`. `first` is the hidden vector before the window.
-    /// An additional layer needs one more line here.
     pub fn forward(&self, pass: &Pass<'_>, first: &[f32]) -> Result<Tensor> {
         let x = self.encoder.forward(pass)?;
         self.gru.forward(&x, first)

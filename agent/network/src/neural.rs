@@ -18,8 +18,7 @@ use emberwatch_model::grid::Probabilities;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Settings of Adam: PyTorch's default decay rates, and the norm at which gradients are clipped. Each update sets the
-/// learning rate.
+/// PyTorch's default decay rates. Each update sets the learning rate.
 const ADAM: AdamSettings = AdamSettings {
     learning_rate: 0.0,
     betas: [0.9, 0.999],
@@ -36,8 +35,7 @@ const BATCH_CELLS: usize = 65_536;
 /// Maximum number of cells in one pass of predictions with candle's operators: 64 grids of 64 x 64.
 const PASS_CELLS: usize = 262_144;
 
-/// The sightings of a world, and, if the network corrects the predictions of a filter, the filter's prediction,
-/// `[O, H, W]`.
+/// A world's sightings, and the prediction `[O, H, W]` of the filter that the network corrects, if any.
 pub type AgentObservation<'a> = (&'a Sightings, Option<&'a Probabilities>);
 
 /// The network, its variables and its optimiser. Clones share the variables, so an update of one clone changes all.
@@ -58,8 +56,7 @@ pub struct Lesson {
     pub before: Sightings,
     /// The row-major index and the value of each observed cell, for at least one cell.
     pub frame: Vec<(usize, u8)>,
-    /// The prediction for the observed cells, `[cells, O]`, by the filter that the network corrects. Empty if the
-    /// network corrects no filter.
+    /// The corrected filter's prediction for the observed cells, `[cells, O]`; empty without a filter.
     pub base: Vec<f32>,
 }
 
@@ -214,8 +211,7 @@ impl NeuralBelief {
     /// If there is no lesson, if a lesson has no cells, or if only some lessons have a base.
     pub fn loss(&self, lessons: &[Lesson]) -> Result<Tensor, NetworkError> {
         let shape = lessons[0].before.shape();
-        let extents = lessons.iter().map(|it| extent(shape, it.cells()));
-        let extents: Vec<_> = extents.collect();
+        let extents: Vec<_> = lessons.iter().map(|it| extent(shape, it.cells())).collect();
         let sides = Crop::sides(shape, &extents);
         let n = (BATCH_CELLS / (sides[0] * sides[1])).clamp(1, lessons.len());
         let (mut cells, mut values) = (Vec::new(), Vec::new());
@@ -247,7 +243,6 @@ impl NeuralBelief {
         })
     }
 
-    /// Computes the last layers at the observed cells only.
     fn loss_at(
         &self,
         images: &Tensor,
@@ -266,8 +261,7 @@ impl NeuralBelief {
         log_p.mean_all()?.neg()
     }
 
-    /// Computes the same loss as `loss_at`, but as a weighted sum over all cells, without gather or scatter. Unobserved
-    /// cells have weight 0.
+    /// The same loss as `loss_at`, but as a weighted sum over all cells, without gather or scatter.
     fn loss_of_all(
         &self,
         images: &Tensor,
@@ -338,7 +332,6 @@ impl NeuralBelief {
         Ok(())
     }
 
-    /// Returns the logarithms of probabilities, after raising each probability to at least [`LEAST`].
     fn logarithms<'a>(
         &self,
         probabilities: impl Iterator<Item = &'a f32>,

@@ -18,14 +18,10 @@ pub struct Pass<'a> {
     moments: RefCell<Vec<KeptMoments>>,
 }
 
-/// The moments of a window at one normalisation.
 #[derive(Debug)]
 pub(crate) struct KeptMoments {
-    /// The name of the normalisation.
     pub(crate) norm: String,
-    /// Mean and population variance of each channel.
     pub(crate) moments: [Tensor; 2],
-    /// Number of values per channel.
     pub(crate) count: f64,
 }
 
@@ -82,7 +78,6 @@ impl<'a> Pass<'a> {
         });
     }
 
-    /// Returns the moments that the normalisations stored.
     pub(crate) fn into_moments(self) -> Vec<KeptMoments> {
         self.moments.into_inner()
     }

@@ -47,12 +47,10 @@ impl FrameReplay {
         }
     }
 
-    /// Returns the number of the oldest frame in the buffer, counted from the first frame ever added.
     fn n_oldest(&self) -> u64 {
         self.n_pushed - self.frames.len() as u64
     }
 
-    /// Returns the possible starts of windows of the given length, as ranges of indices.
     fn starts(&self, length: usize) -> Vec<Range<usize>> {
         let oldest = self.n_oldest();
         let begins = self.begins.iter().map(|begin| (begin - oldest) as usize);
@@ -72,8 +70,7 @@ impl FrameReplay {
         self.frames.is_empty()
     }
 
-    /// Returns `length` consecutive frames of one track, from a random start that depends on the seed and the update.
-    /// Returns `None` if no track has `length` frames.
+    /// Returns `length` consecutive frames of one track, from a random start; `None` if no track is as long.
     pub fn window(&self, length: usize, seed: u64, update: u64) -> Option<Window> {
         let starts: Vec<usize> = self.starts(length).into_iter().flatten().collect();
         let mut rng = stream(seed, Purpose::Replay, update);

@@ -106,29 +106,16 @@ impl NetworkShape {
 mod tests {
     use super::*;
 
-    fn shape(height: usize, width: usize) -> NetworkShape {
-        NetworkShape {
-            grid: Shape::new(height, width).expect("valid shape"),
-            n_states: 3,
-            n_observations: 3,
-            encoding: 4,
-            hidden: 4,
-        }
-    }
-
-    #[test]
-    fn the_grid_of_the_paper_has_the_authors_sizes() {
-        let shape = shape(64, 64);
-        assert_eq!(shape.seed(), [4, 4]);
-        let outputs = shape.convolutions().map(|conv| conv.output);
-        assert_eq!(outputs, [[15, 15], [6, 6], [4, 4]]);
-        assert_eq!(shape.features(), 128);
-    }
-
     #[test]
     fn other_grids_are_padded_and_their_kernels_reduced() {
         let sizes = |height, width| {
-            let shape = shape(height, width);
+            let shape = NetworkShape {
+                grid: Shape::new(height, width).expect("valid shape"),
+                n_states: 3,
+                n_observations: 3,
+                encoding: 4,
+                hidden: 4,
+            };
             let [.., last] = shape.convolutions();
             (shape.padded(), last.kernel, last.output)
         };

@@ -4,7 +4,6 @@ use crate::crop::Crop;
 use emberwatch_model::frame::{Frame, UNOBSERVED};
 use emberwatch_model::grid::Shape;
 
-/// Number of bytes of a [`Sighting`] in [`Sightings::to_bytes`].
 const SIGHTING_BYTES: usize = 5;
 
 /// Maximum age in the features of a sighting, in steps. Older sightings have the same features.
@@ -32,15 +31,13 @@ pub struct Sightings {
     cells: Vec<[Sighting; 2]>,
 }
 
-/// The computation of cells' features. A table contains the features that depend on an age, for ages from 0 to
-/// [`OLDEST`].
+/// The computation of cells' features, with a table of those that depend on an age from 0 to [`OLDEST`].
 #[derive(Debug, Clone)]
 pub struct Features {
     n_observations: usize,
     ages: Vec<Age>,
 }
 
-/// The features of an age.
 #[derive(Debug, Clone, Copy)]
 struct Age {
     freshness: [f32; 3],
@@ -89,14 +86,12 @@ impl Sightings {
         self.step = self.step.saturating_add(1);
     }
 
-    /// Returns the value that a cell showed last and the number of steps since then, or `None` if the cell was never
-    /// seen.
+    /// Returns the value that a cell showed last and the number of steps since then, if it was ever seen.
     pub fn last(&self, cell: usize) -> Option<(u8, u32)> {
         let [last, _] = self.cells[cell];
         (last.value != UNOBSERVED).then(|| (last.value, self.step - last.step))
     }
 
-    /// Returns whether the sightings fit a grid and a number of observations.
     fn are_of(&self, shape: Shape, n_observations: usize) -> bool {
         let fits = |seen: &Sighting| {
             let is_value = usize::from(seen.value) < n_observations || seen.value == UNOBSERVED;
@@ -118,8 +113,7 @@ impl Sightings {
         bytes
     }
 
-    /// Decodes the bytes of [`Self::to_bytes`], or returns `None` if they do not fit the grid and the number of
-    /// observations.
+    /// Decodes [`Self::to_bytes`]. `None` if the bytes do not fit the grid and the number of observations.
     pub fn from_bytes(bytes: &[u8], shape: Shape, n_observations: usize) -> Option<Self> {
         let (step, seen) = bytes.split_first_chunk()?;
         let (seen, []) = seen.as_chunks::<SIGHTING_BYTES>() else {
@@ -183,7 +177,6 @@ impl Features {
         }
     }
 
-    /// Calls `to(feature, number)` for each nonzero feature of a cell.
     fn write_cell(&self, sightings: &Sightings, cell: usize, mut to: impl FnMut(usize, f32)) {
         let n = self.n_observations;
         let [last, before] = sightings.cells[cell].map(|seen| {

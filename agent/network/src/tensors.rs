@@ -7,18 +7,15 @@ use candle_core::{DType, Result, Tensor, Var};
 /// Name, shape and row-major numbers.
 pub type NamedTensor = (String, Vec<usize>, Vec<f32>);
 
-/// A variable's name, the variable, and its new value.
 pub(crate) type Change = (String, Var, Tensor);
 
 /// Groups of variables, each with the prefix of its names in a checkpoint.
 pub(crate) type Groups<'a> = &'a [(&'static str, &'a Variables)];
 
-/// Returns the values of a tensor, row-major.
 pub(crate) fn numbers_of(tensor: &Tensor) -> Result<Vec<f32>> {
     tensor.to_dtype(DType::F32)?.flatten_all()?.to_vec1()
 }
 
-/// Lists all variables with their names in a checkpoint.
 pub(crate) fn named<'a>(groups: Groups<'a>) -> impl Iterator<Item = (String, &'a Tensor)> {
     groups.iter().flat_map(|(prefix, variables)| {
         let variables = variables.iter();
@@ -26,15 +23,12 @@ pub(crate) fn named<'a>(groups: Groups<'a>) -> impl Iterator<Item = (String, &'a
     })
 }
 
-/// Returns all variables as plain numbers.
 pub(crate) fn named_numbers(groups: Groups<'_>) -> Result<Vec<NamedTensor>> {
     named(groups)
         .map(|(name, tensor)| Ok((name, tensor.dims().to_vec(), numbers_of(tensor)?)))
         .collect()
 }
 
-/// Returns the changes that set all variables to new values. `find` returns the values of a tensor with a given name
-/// and shape.
 pub(crate) fn found<E: From<NetworkError>>(
     groups: Groups<'_>,
     find: impl Fn(&str, &[usize]) -> std::result::Result<Vec<f32>, E>,
@@ -47,7 +41,6 @@ pub(crate) fn found<E: From<NetworkError>>(
     named(groups).zip(variables).map(change).collect()
 }
 
-/// Applies changes to variables.
 pub(crate) fn set(changes: &[Change]) -> Result<()> {
     changes
         .iter()

@@ -31,7 +31,6 @@ pub struct UNet {
     head: Layer,
 }
 
-/// A convolution with bias.
 #[derive(Debug)]
 struct Layer {
     conv: ImageConv,
@@ -89,8 +88,7 @@ impl UNet {
         self.head.forward(&last.residual(&full)?)
     }
 
-    /// Computes the logits of the given cells, `[cells, observations]`. The last layers skip all other cells. Each cell
-    /// is specified by its image, row and column.
+    /// Computes logits `[cells, observations]` of cells (image, row and column). The last layers skip other cells.
     pub fn logits_at(&self, x: &Tensor, cells: &[[usize; 3]]) -> Result<Tensor> {
         let [full, half] = self.features(x)?;
         let [point, last] = &self.up[1];
@@ -111,7 +109,6 @@ impl UNet {
         self.head.dense(&(last.dense(&patches)?.relu()? + middle)?)
     }
 
-    /// Computes the inputs of the last upsampling: features at full size and at half size.
     fn features(&self, x: &Tensor) -> Result<[Tensor; 2]> {
         let full = self.full.forward(x)?;
         let [strided, same] = &self.down[0];
@@ -124,7 +121,6 @@ impl UNet {
         Ok([full, same.residual(&half)?])
     }
 
-    /// Doubles the size of an image by repeating its cells, adds an image of that size, and applies ReLU.
     fn doubled_sum(&self, small: &Tensor, large: &Tensor) -> Result<Tensor> {
         if self.head.operators == Operators::Own {
             return small.apply_op2(large, DoubledSum);
@@ -169,7 +165,6 @@ impl Layer {
         }
     }
 
-    /// Computes [`Self::forward`] with candle's operators.
     fn stock(&self, x: &Tensor) -> Result<Tensor> {
         let ImageConv {
             kernel,

@@ -130,17 +130,13 @@ mod tests {
     }
 
     #[test]
-    fn initial_values_depend_only_on_seed_and_name() {
+    fn initial_values_have_the_requested_distribution_and_depend_only_on_seed_and_name() {
         let init = uniform_init(16);
         assert_eq!(numbers(1, "a", init), numbers(1, "a", init));
         assert_ne!(numbers(1, "a", init), numbers(2, "a", init));
         assert_ne!(numbers(1, "a", init), numbers(1, "b", init));
-    }
-
-    #[test]
-    fn initial_values_have_the_requested_distribution() {
         let largest = |numbers: Vec<f32>| numbers.iter().fold(0.0_f32, |max, x| max.max(x.abs()));
-        assert!((0.24..=0.25).contains(&largest(numbers(1, "a", uniform_init(16)))));
+        assert!((0.24..=0.25).contains(&largest(numbers(1, "a", init))));
         let normal = Init::Randn {
             mean: 0.0,
             stdev: 2.0,

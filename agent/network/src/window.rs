@@ -5,7 +5,6 @@ use candle_core::{DType, Device, Result, Tensor};
 use emberwatch_model::frame::Frame;
 use std::sync::Arc;
 
-/// One visited cell of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Visit {
     pub(crate) row: u16,
@@ -38,7 +37,6 @@ impl Window {
         Self { visits, starts }
     }
 
-    /// Creates a window of frames without observations.
     pub(crate) fn blank(n_frames: usize) -> Self {
         Self {
             visits: Arc::new([]),
@@ -71,7 +69,6 @@ impl Window {
         }
     }
 
-    /// Returns the cells to predict after all frames. Each cell is one term of the loss.
     pub(crate) fn all_targets(&self) -> &[Visit] {
         &self.visits[self.starts[1.min(self.len())]..]
     }
@@ -81,7 +78,6 @@ impl Window {
         !self.all_targets().is_empty()
     }
 
-    /// Returns whether the network has all cells and observations of the window.
     pub(crate) fn fits(&self, shape: &NetworkShape) -> bool {
         let (height, width) = shape.grid.dim();
         self.visits.iter().all(|visit| {

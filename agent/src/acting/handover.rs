@@ -43,8 +43,7 @@ pub fn resume(client: &mut Client, number: u32, acting: &mut ActingAgent) -> Res
     Ok(false)
 }
 
-/// Updates the belief of an agent that missed steps with the missed frames and the present frame. The belief is then
-/// the posterior.
+/// Updates the belief of an agent with the frames that it missed and the present one, to the posterior.
 pub fn catch_up(
     client: &mut Client,
     number: u32,
@@ -102,8 +101,7 @@ pub fn take_over_left(
     Ok(is_taken)
 }
 
-/// Leaves an agent's belief for the robot's next agent. The belief is a prediction of X_{k+1} that includes the last
-/// observation.
+/// Leaves an agent's belief, a prediction of X_{k+1}, for the robot's next agent.
 pub fn leave(
     client: &mut Client,
     number: u32,

@@ -14,9 +14,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub struct Link {
     pub client: Client,
     truth: Option<TruthFeed>,
-    /// Numbers of the robots that the agent plans for, including the robots that the client holds.
     robots: Range<u32>,
-    /// Ends the wait for a step.
     stop: Arc<AtomicBool>,
 }
 

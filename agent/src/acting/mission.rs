@@ -58,7 +58,6 @@ impl Mission {
         }
     }
 
-    /// Returns the numbers of the mission's robots on a server.
     pub(super) fn numbers(&self, info: &ServerInfo) -> Result<Range<u32>> {
         let (robots, team) = (&self.robots, info.n_robots);
         ensure!(
@@ -75,7 +74,6 @@ impl Mission {
     }
 }
 
-/// Returns a server's information. Fails if the server lacks one of the worlds.
 pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<ServerInfo> {
     let info = connect(instance)?.info().clone();
     if worlds.end > info.n_worlds {
@@ -84,8 +82,7 @@ pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<Server
     Ok(info)
 }
 
-/// Returns a model of recorded worlds, with their states and without transitions. Returns `None` for simulated worlds,
-/// or if the server does not reveal the recorded states.
+/// Returns a model of revealed recorded states without transitions; `None` for simulated worlds.
 pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     let recorded = info.recorded_world.as_ref();
     let description = recorded.and_then(|recorded| recorded.description.as_deref());
@@ -132,7 +129,6 @@ pub(super) fn model_of(
     Ok(model)
 }
 
-/// Checks that a filter's model has the same sensor and no-fly cells as the server.
 fn check_sensor(info: &ServerInfo, model: &Model) -> Result<()> {
     let (expected, got) = (info.n_observations, model.n_observations());
     ensure!(

@@ -25,7 +25,6 @@ use emberwatch_protocol::{Cell, Client, Model, Move};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Minimum time between two warnings about missed steps.
 const WARN_INTERVAL: Duration = Duration::from_secs(10);
 
 /// An agent that holds the lease on robots of one world.
@@ -34,22 +33,17 @@ pub struct Pilot {
     flyer: Flyer,
     model: Model,
     policy: Policy,
-    /// The belief before an episode's first frame, computed when first needed.
     prior: Option<Belief>,
     warned: Option<Instant>,
 }
 
-/// The agent, and the feed on which its belief is published.
 struct Flyer {
-    /// Plans for the agent's own robots and, in a team, for the other robots.
     acting: ActingAgent,
     /// Numbers on the server of all robots that the agent plans for.
     robots: Range<u32>,
     /// Numbers on the server of the robots that it flies.
     own: Range<u32>,
-    /// Number of robots per world.
     team: u32,
-    /// Time that the last plan took to compute.
     planning: Duration,
     feed: Feed,
     /// Whether the next belief is the last one. The last belief is always published.
@@ -107,7 +101,6 @@ impl Pilot {
         Ok(None)
     }
 
-    /// Acquires the robots and creates their agent, before its first frame.
     fn acquire(
         mission: &Mission,
         numbers: &Range<u32>,
@@ -215,7 +208,6 @@ impl Pilot {
         released
     }
 
-    /// Updates the belief after steps that the world made without the agent.
     fn catch_up(&mut self) -> Result<()> {
         let before = self.flyer.acting.step();
         let seen = self.link.observe()?;
@@ -234,7 +226,6 @@ impl Pilot {
 }
 
 impl Actor for Flyer {
-    /// Plans for the agent's robots and for other robots that flew in the last step. Returns the paths of its robots.
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         let is_planned = self.is_planned();
@@ -262,7 +253,6 @@ impl Actor for Flyer {
 }
 
 impl Flyer {
-    /// Publishes the posterior to observers if it is due, or if it is the last.
     fn show(&mut self) {
         if self.feed.is_due() || self.is_last {
             let world = self.own.start / self.team;
@@ -271,20 +261,17 @@ impl Flyer {
         }
     }
 
-    /// Returns the last step's reward, summed over the agent's robots.
     fn reward(&self) -> f64 {
         let own = self.own_indices();
         let results = self.acting.results().skip(own.start).take(own.len());
         results.map(|result| result.reward).sum()
     }
 
-    /// Returns the indices of the agent's robots among all planned robots.
     fn own_indices(&self) -> Range<usize> {
         let index = |number: u32| (number - self.robots.start) as usize;
         index(self.own.start)..index(self.own.end)
     }
 
-    /// Returns, for each robot, whether to plan for it: true for the agent's robots and for other robots that flew.
     fn is_planned(&self) -> Vec<bool> {
         let (own, team) = (self.own_indices(), self.team);
         let hovered = self.acting.observation().world.hovered;
@@ -295,7 +282,6 @@ impl Flyer {
     }
 }
 
-/// Checks that a policy can act on a server's world.
 fn check(
     mission: &Mission,
     info: &ServerInfo,
@@ -332,7 +318,6 @@ fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -
     )?)
 }
 
-/// Creates an agent before its first frame. `seed` is the world's seed, and `first` is the agent's first robot there.
 fn agent(
     mission: &Mission,
     info: &ServerInfo,

@@ -18,8 +18,7 @@ pub struct Summary {
     pub reward: f64,
 }
 
-/// Acts in successive episodes until the mission's steps are done or it must stop. If the server stops, waits for a
-/// new server.
+/// Acts in successive episodes until the mission's steps are done or it must stop. Waits for a new server if one stops.
 pub fn run(mission: &Mission) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut pilot = Pilot::attach(mission)?;
@@ -85,7 +84,6 @@ impl Report {
     }
 }
 
-/// Waits for the server to come back, and attaches again. Returns `None` if the agent must stop first.
 fn attach_again(mission: &Mission) -> Result<Option<Pilot>> {
     let mut mission = mission.clone();
     mission.takeover = false;
@@ -104,7 +102,6 @@ fn attach_again(mission: &Mission) -> Result<Option<Pilot>> {
     Ok(None)
 }
 
-/// Returns whether the robots are held by this process.
 fn is_own_lease(error: &anyhow::Error) -> bool {
     let own_pid = u64::from(std::process::id());
     refusal(error).is_some_and(|(status, detail, _)| (status, detail) == (Status::Busy, own_pid))

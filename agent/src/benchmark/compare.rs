@@ -38,8 +38,7 @@ pub struct Comparison {
     pub learned: Learned,
 }
 
-/// Runs every policy on every world. Returns one run per policy, team and world, in the order of the policies. Calls
-/// `progress` with a policy's name and the number of world steps just made.
+/// Runs every policy on every world. Calls `progress` with a policy's name and the number of world steps just made.
 pub fn compare(
     worlds: &mut ComparedWorlds,
     comparison: &Comparison,
@@ -93,7 +92,6 @@ impl Comparison {
         entries.collect()
     }
 
-    /// Checks that a policy can act in the worlds.
     fn check(&self, policy: &Policy, worlds: &mut ComparedWorlds) -> Result<()> {
         ensure!(
             worlds.has_truth() || policy.belief.input != Input::States,
@@ -104,7 +102,6 @@ impl Comparison {
         building::check(policy, &self.learned, &world)
     }
 
-    /// Starts a batch of worlds with the agents of a policy.
     fn start<'a>(
         &self,
         policy: &Policy,
@@ -141,14 +138,11 @@ impl Comparison {
     }
 }
 
-/// The agents of a batch of worlds, and the measurements of each world.
 struct MeasuredAgents<'a> {
     /// Ordered by world.
     agents: Vec<ActingAgent>,
     tallies: Vec<RunTally>,
-    /// Each agent's last plans, and the time that planning took.
     plans: Vec<(Vec<Plan>, Duration)>,
-    /// Number of robots per world.
     n_robots: usize,
     feed: &'a mut Feed,
 }
@@ -184,7 +178,6 @@ impl Actor for MeasuredAgents<'_> {
 }
 
 impl MeasuredAgents<'_> {
-    /// Publishes the posterior of each agent that is due to be shown to observers.
     fn show(&mut self, n_agents: usize) {
         let n_own = (self.n_robots / n_agents) as u32;
         for index in self.feed.due(self.agents.len()) {

@@ -17,7 +17,6 @@ use std::time::Duration;
 /// Maximum number of worlds in a batch. Their hidden states fit a reader's buffer.
 pub const MAX_BATCH: u32 = 32;
 
-/// Time to live of an unused lease on a comparison's worlds.
 const LEASE: Duration = Duration::from_secs(3600);
 
 /// Worlds on which policies are compared.
@@ -31,9 +30,7 @@ pub struct ComparedWorlds {
     pub n_worlds: u32,
     /// Number of robots per agent: one, or all robots of a world.
     robots_per_agent: usize,
-    /// Seeds of the running worlds.
     seeds: Vec<u64>,
-    /// Number of steps since the reset.
     step: u64,
 }
 
@@ -74,10 +71,7 @@ impl ComparedWorlds {
         self.known.as_ref().unwrap_or(&self.model)
     }
 
-    /// Sets the model with which beliefs predict recorded worlds.
-    ///
-    /// # Errors
-    /// If the model's states, rewards or sensor differ from those of the worlds.
+    /// Sets the model that predicts recorded worlds, if its states, rewards and sensor are those of the worlds.
     pub fn know(&mut self, model: Model) -> Result<()> {
         check_recorded(self.info(), &self.model, &model)?;
         self.known = Some(model);
@@ -150,7 +144,6 @@ impl ComparedWorlds {
         0..self.seeds.len() as u32 * self.info().n_robots
     }
 
-    /// Returns what agents see at the present step, with the hidden states if they can be read.
     fn seen(&mut self, observations: Vec<Observation>) -> Result<Vec<AgentObservation>> {
         let n_worlds = self.seeds.len();
         let truth = self.client.backend().states(&self.seeds, self.step)?;

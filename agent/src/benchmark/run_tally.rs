@@ -17,21 +17,16 @@ use std::time::Duration;
 /// The measurements of one world's run, summed over its steps.
 pub struct RunTally {
     seed: u64,
-    /// The state with the highest reward.
     target: usize,
-    /// Number of cells in that state, summed over steps.
     fire_cells: f64,
     rewards: Vec<f32>,
     reward: f64,
     n_visited: u64,
     n_hits: u64,
-    /// Number of distinct cells that each robot visits in a step, summed over robots and steps.
     n_visited_each: u64,
     planning: Duration,
-    /// Sum of Brier scores; `None` if hidden states are not published.
     brier: Option<f64>,
     score: Score,
-    /// Flights of the present step, collected until all robots have flown.
     flights: Vec<Flight>,
     merit: MeritTally,
 }
@@ -98,8 +93,7 @@ impl RunTally {
     /// Summarises the run as a row of the results.
     pub fn into_run(self, policy: &Policy, team: Team, info: &ServerInfo) -> PolicyRun {
         let (steps, merit) = (self.rewards.len() as u64, self.merit.merit());
-        let brier = self.brier;
-        let brier = brier.filter(|_| policy.belief.input != Input::Nothing);
+        let brier = self.brier.filter(|_| policy.belief.input != Input::Nothing);
         let mean = |sum: f64| sum / steps.max(1) as f64;
         let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
         PolicyRun {

@@ -17,7 +17,6 @@ const BAR: i32 = 36;
 const TOP: i32 = HEAD + 60;
 /// Height of the tick labels and the axis label.
 const FOOT: i32 = 110;
-/// Maximum widths of a row's label and of its value.
 const MAX_NAME: i32 = 710;
 const MAX_VALUE: i32 = 400;
 
@@ -107,7 +106,6 @@ impl Ladder {
         Ok(())
     }
 
-    /// Draws the kinds of bars, in order of appearance.
     fn draw_legend(&self, page: &Area<'_>) -> Result<()> {
         let mut kinds: Vec<(&str, RGBColor)> = Vec::new();
         for bar in &self.bars {
@@ -162,8 +160,7 @@ impl Bar {
         worlds.chain(ends).chain([self.value])
     }
 
-    /// Returns the worlds to draw. The dot of a single world is omitted, because it would coincide with the end of the
-    /// bar.
+    /// The dot of a single world would coincide with the end of the bar.
     fn dots(&self) -> impl Iterator<Item = (u64, f64)> + '_ {
         let are_apart = self.worlds.len() > 1 || !is_drawable(self.value);
         let worlds = self.worlds.iter().copied();

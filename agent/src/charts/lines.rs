@@ -129,8 +129,7 @@ impl Lines {
                 Scale::Linear => panel.draw(&area, &frame, covering(values()))?,
                 Scale::Logarithmic => {
                     let least = values().fold(f64::MAX, f64::min).log10().floor();
-                    let most = values().fold(0.0, f64::max).log10().ceil();
-                    let most = most.max(least + 1.0);
+                    let most = values().fold(0.0, f64::max).log10().ceil().max(least + 1.0);
                     // Slightly more than the powers of ten, because plotters rounds their ticks.
                     let range = 0.999 * 10_f64.powf(least)..1.001 * 10_f64.powf(most);
                     panel.draw(&area, &frame, range.log_scale())?;
@@ -144,13 +143,9 @@ impl Lines {
     }
 }
 
-/// What all panels share.
 struct Frame {
-    /// The right edge of the plots.
     right: i32,
-    /// The last value of the horizontal axis.
     last: f64,
-    /// Maximum numbers of ticks of the horizontal and of the vertical axis.
     n_ticks: [usize; 2],
 }
 
@@ -238,7 +233,6 @@ impl Panel {
         Ok(area.draw_text(&title, &style(LABEL, INK, HPos::Left), (MARGIN, 18))?)
     }
 
-    /// Writes each curve's name next to its end on the page, with a connecting line.
     fn draw_names(&self, area: &Area<'_>, right: i32, ends: &[(i32, i32)]) -> Result<()> {
         let top = area.get_base_pixel().1;
         let heights: Vec<i32> = ends.iter().map(|end| end.1 - top).collect();

@@ -68,8 +68,7 @@ pub fn width(text: &str, size: f64) -> i32 {
     (text.chars().count() as f64 * LETTER * size) as i32
 }
 
-/// Shortens a text to about `room`. A shortened text ends with an ellipsis. Control characters, which are invalid in
-/// XML, become spaces.
+/// Shortens a text to about `room`, with an ellipsis. Control characters, invalid in XML, become spaces.
 pub fn fit(text: &str, size: f64, room: i32) -> String {
     let printable = |letter: char| match letter {
         '\u{fffe}' | '\u{ffff}' => ' ',

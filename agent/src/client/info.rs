@@ -9,7 +9,6 @@ use emberwatch_protocol::task::Task;
 use emberwatch_protocol::{Connection, Model};
 use std::time::Duration;
 
-/// Name of this program in the server's log.
 const NAME: &str = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
 
 /// Time between two attempts to reach an absent server.

@@ -8,7 +8,6 @@ use emberwatch_protocol::{Grid, Shape};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// How long the hidden states may take to arrive after their step.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A reader of the channel `truth` that keeps pace with a client that acts.

@@ -5,8 +5,7 @@ use emberwatch_protocol::feed::View;
 use std::ops::Range;
 use std::time::Duration;
 
-/// Returns an agent's belief after a step, with the policy and objective behind its last path. `planning` is the time
-/// that planning took.
+/// Returns an agent's belief with the policy and objective of its last path, which took `planning` to plan.
 pub fn view(acting: &ActingAgent, world: u32, robots: Range<u32>, planning: Duration) -> View<'_> {
     View {
         world,

@@ -28,9 +28,6 @@ pub enum Worlds {
 
 impl Worlds {
     /// Connects to a running server. With `reads_truth`, also reads hidden states, if the server publishes them.
-    ///
-    /// # Errors
-    /// If no server runs on the instance.
     pub fn attach(instance: &Instance, reads_truth: bool) -> Result<Self> {
         let connection = connect(instance)?;
         let info = connection.info();
@@ -46,9 +43,6 @@ impl Worlds {
     }
 
     /// Simulates worlds in this process, and starts their burn-ins. Warns of settings that do badly.
-    ///
-    /// # Errors
-    /// If there is too little memory, or no threads can be started.
     pub fn simulate(settings: Checked) -> Result<Self> {
         for warning in settings.warnings() {
             tracing::warn!("{warning}");

@@ -26,10 +26,8 @@ use emberwatch_protocol::task::Task;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Maximum time between two lines about the progress.
 const PROGRESS_INTERVAL: Duration = Duration::from_secs(10);
 
-/// The default policy for comparisons of teams.
 const TEAM_POLICY: &str = "beam";
 
 /// Compare policies on the same worlds.
@@ -140,8 +138,7 @@ impl CompareCommand {
         Ok(added)
     }
 
-    /// Checks the rows of `--add` before a comparison runs. Skips rows whose number of robots is another entry of
-    /// `--robots`.
+    /// Skips rows whose number of robots is another entry of `--robots`.
     fn check_added(
         &self,
         added: &[PolicyRun],
@@ -165,7 +162,6 @@ impl CompareCommand {
         Ok(())
     }
 
-    /// Checks the CSV file and creates the folder for figures.
     fn make_places(&self) -> Result<()> {
         self.figures.as_deref().map_or(Ok(()), make_folder)?;
         self.csv.as_deref().map_or(Ok(()), check_csv)
@@ -193,14 +189,12 @@ impl CompareCommand {
         Ok(policies)
     }
 
-    /// Returns whether worlds have several robots, or `--team` names other kinds than `alone`.
     fn has_teams(&self, task: Option<&Task>) -> bool {
         let of_task = task.map(|task| task.world.robots);
         let mut robots = self.worlds.robots().into_iter().chain(of_task);
         robots.any(|robots| robots > 1) || self.team != [Team::Alone]
     }
 
-    /// Returns the name of the baseline: `--baseline`, or the default for teams or the ladder.
     fn baseline(
         &self,
         worlds: &ComparedWorlds,
@@ -219,7 +213,6 @@ impl CompareCommand {
     }
 }
 
-/// The results for all numbers of robots.
 #[derive(Default)]
 struct Report {
     runs: Vec<PolicyRun>,
@@ -238,7 +231,6 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     replace_file(&path, settings.as_bytes())
 }
 
-/// Runs a comparison and logs its progress.
 pub(super) fn run_comparison(
     worlds: &mut ComparedWorlds,
     comparison: &Comparison,

@@ -97,7 +97,6 @@ impl RunCommand {
     }
 }
 
-/// Parses the number of a robot, or a range.
 fn parse_robots(text: &str) -> Result<Range<u32>, String> {
     let one = text
         .parse()
@@ -106,8 +105,7 @@ fn parse_robots(text: &str) -> Result<Range<u32>, String> {
     one.map_or_else(|| parse_range(text), Ok)
 }
 
-/// Parses a rate of at least 1 step per second. Observers would take a slower agent for dead, and a slower agent would
-/// stop late.
+/// Observers would take an agent with less than 1 step per second for dead, and it would stop late.
 fn parse_rate(text: &str) -> Result<f64, String> {
     let rate: f64 = text.parse().unwrap_or(f64::NAN);
     if rate.is_finite() && rate >= 1.0 {

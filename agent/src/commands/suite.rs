@@ -88,7 +88,6 @@ impl SuiteCommand {
         write(&render_suite(&runs))
     }
 
-    /// Returns the plan for a task, and reads the rows of other policies in its folder.
     fn plan(&self, settings: Checked, config: &AgentConfig) -> Result<Plan> {
         let task = settings.task.as_ref().expect("invariant: it has a task");
         let mut seeds = task.test_seeds.clone();
@@ -138,8 +137,7 @@ impl SuiteCommand {
         })
     }
 
-    /// Trains what the policies of a task need, then runs each policy. Returns their rows and those of other policies in
-    /// the folder. Warns about policies that cannot run or were measured on other worlds, and leaves them out.
+    /// Warns about policies that cannot run or were measured on other worlds, and leaves them out.
     fn carry_out(&self, plan: &Plan) -> Result<Vec<PolicyRun>> {
         let task = &plan.task().name;
         let mut ready = Vec::new();
@@ -171,7 +169,6 @@ impl SuiteCommand {
         Ok(runs)
     }
 
-    /// Reads a policy's checkpoints. With `--train`, first runs the missing trainings.
     fn prepare(&self, plan: &Plan, policy: &Policy) -> Result<Trained> {
         ensure!(
             !(plan.task().world.is_recorded() && policy.belief.knows_model),
@@ -193,12 +190,9 @@ impl SuiteCommand {
     }
 }
 
-/// The policies and worlds of one task of a suite, and the rows of other policies in its folder.
 struct Plan {
-    /// Settings of the task's worlds.
     settings: Checked,
     worlds: Vec<World>,
-    /// The comparison of all policies, without checkpoints.
     comparison: Comparison,
     form: WorldForm,
     folder: PathBuf,
@@ -211,7 +205,6 @@ impl Plan {
         task.expect("invariant: a suite's settings have a task")
     }
 
-    /// Simulates the worlds, and acquires them.
     fn open(&self) -> Result<ComparedWorlds> {
         let n_worlds = self.worlds.len() as u32;
         let mut settings = self.settings.clone();
@@ -220,7 +213,6 @@ impl Plan {
         ComparedWorlds::open(Worlds::simulate(settings)?, n_worlds)
     }
 
-    /// Returns the rows of other policies that are from this suite's worlds.
     fn comparable(&self) -> Vec<PolicyRun> {
         let (task, seeds) = (&self.task().name, &self.comparison.seeds);
         let mut comparable = Vec::new();

@@ -137,7 +137,6 @@ impl TrainCommand {
         })
     }
 
-    /// Refuses flags that the learner would ignore.
     fn check_flags(&self, kind: &LearnerKind) -> Result<()> {
         for (flag, is_given) in [
             ("coverage", self.coverage.is_some()),
@@ -156,7 +155,6 @@ impl TrainCommand {
         Ok(())
     }
 
-    /// Reads the belief that the learner builds on.
     fn learned(
         &self,
         kind: &LearnerKind,
@@ -178,8 +176,7 @@ impl TrainCommand {
         Ok(learned)
     }
 
-    /// Returns the contents of the checkpoint to resume, and adopts the settings that it determines. Returns `None`
-    /// without `--resume`, or if a training was interrupted while it still trained its belief.
+    /// `None` without `--resume`, or if a training was interrupted while it still trained its belief.
     fn contents(&self, training: &mut TrainingSpec) -> Result<Option<Contents>> {
         if !self.resume {
             return training.check();
@@ -203,13 +200,11 @@ impl TrainCommand {
         Ok(contents)
     }
 
-    /// Returns the seed of the first world of a resumed training, which depends on the number of world steps done.
     fn next_seed(&self, done: u64) -> u64 {
         let drawn = || stream(FIRST_TRAINING_SEED, Purpose::Episode, done).next_u64() >> 11;
         self.seed.unwrap_or_else(drawn)
     }
 
-    /// Limits a resumed training to the remaining steps of the settings, unless `--steps` is given.
     fn limit_steps(&self, done: u64, training: &mut TrainingSpec) -> Result<()> {
         let all = (training.learner()?.steps)(&training.config);
         if self.steps.is_none() && all > 0 {
@@ -222,7 +217,6 @@ impl TrainCommand {
         Ok(())
     }
 
-    /// Attaches to the server, or starts to simulate worlds.
     fn worlds(&self, training: &TrainingSpec) -> Result<Worlds> {
         let episode_steps = (training.learner()?.episode_steps)(&training.config);
         if let Some(name) = &self.instance {
@@ -253,7 +247,6 @@ impl TrainCommand {
     }
 }
 
-/// Starts to simulate worlds for a training.
 pub(super) fn simulate(mut settings: Checked, training: &TrainingSpec) -> Result<Worlds> {
     // A learner that learns a model must not see the true model.
     settings.config.reveal_model = training.base()?.is_some_and(|base| base.knows_model);
@@ -261,13 +254,11 @@ pub(super) fn simulate(mut settings: Checked, training: &TrainingSpec) -> Result
     Worlds::simulate(settings.with_worlds(training.worlds.len() as u32)?)
 }
 
-/// Returns whether the belief that the learner builds on must be trained first.
 fn needs_belief(training: &TrainingSpec) -> Result<bool> {
     let is_missing = |base: &BeliefKind| base.learned(&training.learned).is_err();
     Ok(training.learner()?.needs_base && training.base()?.is_some_and(is_missing))
 }
 
-/// Trains the belief that decisions are based on, unless its training is complete.
 fn learn_belief(worlds: &mut Worlds, training: &TrainingSpec, stop: &AtomicBool) -> Result<()> {
     let Some(belief) = training.belief_training()? else {
         return Ok(());
@@ -276,7 +267,6 @@ fn learn_belief(worlds: &mut Worlds, training: &TrainingSpec, stop: &AtomicBool)
     learn(worlds, &belief, belief.check()?, stop)
 }
 
-/// Trains, logs a summary, and draws the metrics.
 pub(super) fn learn(
     worlds: &mut Worlds,
     training: &TrainingSpec,

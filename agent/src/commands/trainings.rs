@@ -71,7 +71,6 @@ impl Trainings<'_> {
         Ok(Trained { learned, seconds })
     }
 
-    /// Returns learner and folder of each training, the belief first.
     fn folders(&self) -> impl Iterator<Item = (&'static str, PathBuf)> {
         let belief = self.policy.belief;
         let by = belief.learned_by.as_ref();

@@ -61,9 +61,6 @@ pub enum Source {
 
 impl SimulationFlags {
     /// Returns checked settings of worlds to simulate. `default`: the settings without flags.
-    ///
-    /// # Errors
-    /// If a setting is invalid, or a task or recorded states already decide it.
     pub fn check(&self, default: ServerConfig) -> Result<Checked, ConfigError> {
         check(&self.given(), default)
     }
@@ -94,11 +91,7 @@ impl WorldFlags {
         numbers.map(|number| number as u32).collect()
     }
 
-    /// Checks the settings of the worlds, without opening them. `n_robots`: the number of robots per world, if it was
-    /// given.
-    ///
-    /// # Errors
-    /// If the settings are invalid.
+    /// Checks the settings of the worlds without opening them. `n_robots`: robots per world, if given.
     pub fn source(&self, n_robots: Option<u32>) -> Result<Source> {
         if let Some(name) = &self.instance {
             return Ok(Source::Server(Instance::new(name)?));
@@ -152,9 +145,6 @@ impl Source {
     }
 
     /// Opens the worlds for a comparison on `n_seeds` seeds.
-    ///
-    /// # Errors
-    /// If there is no such server, the worlds cannot be simulated, or the model of beliefs does not fit them.
     pub fn open(self, n_seeds: u32) -> Result<ComparedWorlds> {
         match self {
             Self::Server(instance) => {
@@ -170,7 +160,6 @@ impl Source {
     }
 }
 
-/// Checks the default settings with the values that were given.
 fn check(given: &Map<String, Value>, mut default: ServerConfig) -> Result<Checked, ConfigError> {
     if given.get("robots").and_then(Value::as_u64) > Some(1) {
         // With the same start and the same belief, all robots would fly the same path forever.
@@ -207,43 +196,33 @@ mod tests {
     use clap::Parser;
 
     #[derive(Parser)]
-    struct Compare {
+    struct Flags<T: Args> {
         #[command(flatten)]
-        worlds: WorldFlags,
-    }
-
-    #[derive(Parser)]
-    struct Train {
-        #[command(flatten)]
-        worlds: SimulationFlags,
+        worlds: T,
     }
 
     fn compare(flags: &str) -> WorldFlags {
-        Compare::parse_from(flags.split(' ')).worlds
+        Flags::parse_from(flags.split(' ')).worlds
     }
 
     #[test]
     fn several_numbers_of_robots_are_for_comparisons() {
-        for (flags, robots) in [
-            ("", vec![]),
-            (" --robots 3", vec![3]),
-            (" --robots 4,1", vec![4, 1]),
-        ] {
-            assert_eq!(compare(&format!("compare{flags}")).robots(), robots);
-        }
-        let refused = Train::try_parse_from(["train", "--robots", "1,2"]);
-        let refused = refused
-            .err()
-            .map(|error| error.to_string())
-            .unwrap_or_default();
-        assert!(refused.contains("'1,2'"), "{refused}");
-        assert!(refused.contains("expected 1 to 64"), "{refused}");
+        assert_eq!(compare("compare --robots 4,1").robots(), [4, 1]);
+        let flags = ["train", "--robots", "1,2"];
+        let refused = Flags::<SimulationFlags>::try_parse_from(flags).map(drop);
+        let refused = refused.expect_err("two numbers").to_string();
+        let is_named = refused.contains("'1,2'") && refused.contains("expected 1 to 64");
+        assert!(is_named, "{refused}");
     }
 
     #[test]
     fn robots_of_a_team_start_in_random_cells() {
-        let train = Train::parse_from(["train", "--robots", "2"]).worlds;
-        let of_training = train.check(ServerConfig::default()).expect("valid").config;
+        let train = Flags::<SimulationFlags>::parse_from(["train", "--robots", "2"]);
+        let of_training = train
+            .worlds
+            .check(ServerConfig::default())
+            .expect("valid")
+            .config;
         assert_eq!(of_training.world.start, Start::Random);
         let starts = [1, 2].map(|robots| match compare("compare").source(Some(robots)) {
             Ok(Source::Settings(checked, _)) => checked.config.world.start,
@@ -258,10 +237,7 @@ mod tests {
         let Ok(Source::Settings(checked, known)) = flags.source(None) else {
             panic!("expected settings");
         };
-        assert_eq!(
-            checked.model,
-            model_named("wildfire-small").expect("built in")
-        );
-        assert_eq!(known, None);
+        let expected = model_named("wildfire-small").expect("built in");
+        assert_eq!((checked.model, known), (expected, None));
     }
 }

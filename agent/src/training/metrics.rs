@@ -110,7 +110,6 @@ fn reader(path: &Path) -> csv::Result<csv::Reader<File>> {
     csv::ReaderBuilder::new().flexible(true).from_path(path)
 }
 
-/// Reads the complete rows of a file up to a world step.
 fn kept_rows(path: &Path, more: &[&str], world_steps: u64) -> Result<Vec<StringRecord>> {
     let mut reader = reader(path)?;
     let got = reader.headers()?;
@@ -138,7 +137,6 @@ fn row(tick: &Tick, update: &ModelUpdate) -> Vec<String> {
     counts.into_iter().chain(numbers).collect()
 }
 
-/// Returns the values of a row, without the two counts at its start.
 fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Option<f64>> + 'a {
     let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
     let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;

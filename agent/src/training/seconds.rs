@@ -5,13 +5,11 @@ use emberwatch_learning::file::replace_file;
 use rustix::time::{ClockId, clock_gettime};
 use std::path::{Path, PathBuf};
 
-/// Name of the file in the folder of a training.
 const SECONDS: &str = "processor_seconds.txt";
 
 /// Counts the processor seconds of a training, including earlier runs that it resumes.
 pub struct Stopwatch {
     path: PathBuf,
-    /// Seconds of earlier runs; `None` if they have no record.
     before: Option<f64>,
     start: f64,
 }
@@ -37,9 +35,6 @@ impl Stopwatch {
 }
 
 /// Reads the processor seconds of the training in a folder; `None` if it recorded none.
-///
-/// # Errors
-/// If the file contains anything but a finite number that is at least 0.
 pub fn read(folder: &Path) -> Result<Option<f64>> {
     let path = folder.join(SECONDS);
     if !path.exists() {

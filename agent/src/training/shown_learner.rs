@@ -16,9 +16,7 @@ pub struct ShownLearner<'a> {
     kind: &'static LearnerKind,
     feed: &'a mut Feed,
     robots: Range<u32>,
-    /// Number of robots per world.
     team: u32,
-    /// Time to compute the last plans of all robots together.
     planning: Duration,
 }
 
@@ -39,7 +37,6 @@ impl<'a> ShownLearner<'a> {
         }
     }
 
-    /// Publishes the posterior of each robot that is due to be shown to observers.
     fn show(&mut self) {
         let planning = self.planning / self.robots.len().max(1) as u32;
         for index in self.feed.due(self.robots.len()) {

@@ -35,8 +35,7 @@ pub struct TrainingSpec {
 }
 
 impl TrainingSpec {
-    /// Checks the folder and the number of worlds, before worlds are simulated or robots acquired. Returns the
-    /// contents of the checkpoint to resume.
+    /// Checks folder and number of worlds before anything is opened. Returns the checkpoint to resume.
     pub fn check(&self) -> Result<Option<Contents>> {
         let place = self.out.join(CHECKPOINT);
         ensure!(
@@ -73,8 +72,7 @@ impl TrainingSpec {
         (self.learner()?.base)(&self.config)
     }
 
-    /// Returns the training of the belief that the learner builds on, in a subfolder. Returns `None` if that training
-    /// is complete, or if the belief needs none.
+    /// Returns the training of the belief that the learner needs first, in a subfolder, unless it is complete.
     pub fn belief_training(&self) -> Result<Option<Self>> {
         let by = self.base()?.and_then(|base| base.learned_by.as_ref());
         let Some(by) = by else { return Ok(None) };
@@ -115,7 +113,6 @@ impl TrainingSpec {
         self.out.join("belief")
     }
 
-    /// Returns the numbers of the worlds' robots on a server.
     pub(super) fn robots(&self, info: &ServerInfo) -> Result<Range<u32>> {
         let team = info.n_robots;
         let kind = self.learner()?;

@@ -72,13 +72,10 @@ brier nan"
         .split('\n')
     {
         let (name, text) = line.split_once(' ').unwrap_or((line, ""));
-        let columns = HEADER
-            .split(',')
-            .filter(|name| !["world_seed", "steps", "robots", "mean_reward"].contains(name));
-        let index = columns
-            .into_iter()
-            .position(|column| column == name)
-            .expect("a column");
+        // Numbers have no quotes.
+        let numbers = ["world_seed", "steps", "robots", "mean_reward"];
+        let mut columns = HEADER.split(',').filter(|name| !numbers.contains(name));
+        let index = columns.position(|column| column == name).expect("a column");
         let mut fields = fields.clone();
         fields[1 + 2 * index] = text;
         let refusal = read(&fields.join("\"")).expect_err(line);

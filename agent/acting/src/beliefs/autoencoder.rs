@@ -84,9 +84,7 @@ impl LearnedBelief for AutoencoderModel {
 
 pub struct AutoencoderEstimator {
     network: Autoencoder,
-    /// The hidden vector `h_k`.
     hidden: Vec<f32>,
-    /// The predictor `u_{k+1}`.
     prediction: Belief,
     /// The estimate `p_k` or the predictor `u_{k+1}`.
     belief: Belief,

@@ -34,8 +34,7 @@ pub struct BeliefKind {
     pub build: fn(&Conditions<'_>) -> Result<Box<dyn Estimator>>,
 }
 
-/// The optional traits of a kind's estimators. Each function takes an estimator of this kind, and returns it as the
-/// trait.
+/// The optional traits of a kind's estimators. Each function takes an estimator of this kind.
 #[derive(Clone, Copy)]
 pub struct Traits {
     pub observation_model: Option<fn(&dyn Estimator) -> &dyn ObservationModel>,
@@ -44,8 +43,7 @@ pub struct Traits {
     pub handover_mut: Option<fn(&mut dyn Estimator) -> &mut dyn Handover>,
     /// For kinds that receive the hidden states.
     pub told: Option<fn(&mut dyn Estimator) -> &mut dyn Told>,
-    /// Computes the predictions of several estimators of this kind together, with the same results as alone. `None` if
-    /// this would not be faster.
+    /// Predicts several estimators of this kind together, with the same results as alone, if this is faster.
     pub predict_together: Option<fn(Vec<&mut dyn Estimator>)>,
 }
 
@@ -69,10 +67,7 @@ impl Traits {
     }
 }
 
-/// Returns an estimator as its own type.
-///
-/// # Panics
-/// If it has another type.
+/// Returns an estimator as its own type. Panics if it has another type.
 pub fn cast<E: Estimator>(estimator: &dyn Estimator) -> &E {
     let own = (estimator as &dyn Any).downcast_ref();
     own.expect("invariant: the kind builds estimators of this type")
@@ -130,18 +125,12 @@ pub struct Conditions<'a> {
 }
 
 impl<'a> Conditions<'a> {
-    /// Returns the model.
-    ///
-    /// # Errors
-    /// If the model is unknown.
+    /// Returns the model, or an error if it is unknown.
     pub fn model(&self) -> Result<&'a Model> {
         self.model.context("model: expected a model, got none")
     }
 
-    /// Returns the first belief.
-    ///
-    /// # Errors
-    /// If there is no first belief.
+    /// Returns the first belief, or an error if there is none.
     pub fn prior(&self) -> Result<Belief> {
         let prior = self.prior.cloned();
         prior.context("prior: expected a first belief, got none")
@@ -154,10 +143,7 @@ impl BeliefKind {
         self.learned_by.as_ref().is_some_and(|by| by.decides)
     }
 
-    /// Returns the learned model, or `None` if this kind does not use one.
-    ///
-    /// # Errors
-    /// If this kind needs a learned model and no checkpoint contains it.
+    /// Returns the learned model, `None` if this kind uses none, or an error if no checkpoint contains it.
     pub fn learned<'a>(&self, learned: &'a Learned) -> Result<Option<&'a dyn LearnedBelief>> {
         let Some(by) = &self.learned_by else {
             return Ok(None);
@@ -180,10 +166,7 @@ impl BeliefKind {
         learned.map_or(Ok(()), |learned| learned.check_world(world))
     }
 
-    /// Returns the names of the belief's states.
-    ///
-    /// # Errors
-    /// If both the model and a learned model are missing.
+    /// Returns the names of the belief's states, or an error if both the model and a learned model are missing.
     pub fn state_names(&self, conditions: &Conditions<'_>) -> Result<Vec<String>> {
         Ok(match self.learned(conditions.learned)? {
             Some(learned) => numbered_states(learned.n_states()),
@@ -191,10 +174,7 @@ impl BeliefKind {
         })
     }
 
-    /// Returns the index, in the belief, of the state with the highest reward.
-    ///
-    /// # Errors
-    /// Under the same conditions as [`Self::state_names`].
+    /// Returns the belief's index of the state with the highest reward. Errors are those of [`Self::state_names`].
     pub fn target(&self, conditions: &Conditions<'_>) -> Result<usize> {
         Ok(match self.learned(conditions.learned)? {
             Some(learned) => learned.target(),

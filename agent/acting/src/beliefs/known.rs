@@ -44,13 +44,11 @@ pub const KNOWN_SPATIAL_CAVITIES: BeliefKind = BeliefKind {
     ..KNOWN
 };
 
-/// Builds the filter with the true model.
 fn filter(conditions: &Conditions<'_>, cavities: bool) -> Result<BayesFilter> {
     let model = conditions.model()?;
     Ok(BayesFilter::known(model, conditions.prior()?, cavities)?)
 }
 
-/// Builds a filter with the true model. Its corrections reach the neighbours of visited cells.
 fn spatial(conditions: &Conditions<'_>, cavities: bool) -> Result<SpatialFilter> {
     let (filter, state) = (
         filter(conditions, cavities)?,

@@ -35,7 +35,6 @@ pub const LEARNED_SPATIAL: BeliefKind = BeliefKind {
     ..LEARNED
 };
 
-/// Returns the learned filter of the checkpoint.
 fn model<'a>(conditions: &Conditions<'a>) -> Result<&'a LearnedModel> {
     let model = conditions.learned.get::<LearnedModel>();
     model.context("checkpoint: expected a learned filter, got none")
@@ -63,9 +62,7 @@ impl LearnedModel {
         }
     }
 
-    /// Builds an estimator before its first frame.
-    ///
-    /// If `is_spatial`, corrections reach the neighbours of visited cells.
+    /// Builds an estimator. If `is_spatial`, corrections reach the neighbours of visited cells.
     pub fn estimator(&self, is_spatial: bool, shape: Shape) -> Box<dyn Filter> {
         let filter = BayesFilter::learned(&self.tables, self.tables.prior(shape));
         let neighbours = || (self.target, self.correlations.clone());

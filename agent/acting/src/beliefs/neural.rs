@@ -57,7 +57,6 @@ pub struct NeuralModel {
     pub target: usize,
 }
 
-/// Models are equal if their targets, filters and network parameters are equal.
 impl PartialEq for NeuralModel {
     fn eq(&self, other: &Self) -> bool {
         let parameters = |model: &Self| model.network.parameters().ok();
@@ -94,9 +93,7 @@ impl LearnedBelief for NeuralModel {
     }
 }
 
-/// Builds an estimator before its first frame.
-///
-/// Corrections of the filter, if there is one, reach the neighbours of visited cells.
+/// Builds an estimator. Corrections of the filter, if there is one, reach the neighbours of visited cells.
 pub fn estimator(
     network: &NeuralBelief,
     filter: Option<&LearnedModel>,
@@ -109,16 +106,13 @@ pub fn estimator(
 /// The neural belief of one world.
 pub struct NeuralEstimator {
     network: NeuralBelief,
-    /// The filter whose prediction the network corrects, if any.
     filter: Option<Box<dyn Filter>>,
     /// The distribution over observations that the filter predicts, shape `[O, H, W]`.
     base: Option<Probabilities>,
     sightings: Sightings,
-    /// The belief about the next observation of each cell.
     belief: Belief,
     /// The identity, because the belief is about observations.
     likelihood: Array2<f64>,
-    /// The error of the last prediction, if it failed.
     failure: Option<NetworkError>,
 }
 
@@ -195,8 +189,7 @@ impl Handover for NeuralEstimator {
         if self.failure.is_some() {
             return Vec::new();
         }
-        let filter = self.filter.as_ref();
-        let filter = filter.map_or(Vec::new(), |it| it.to_bytes());
+        let filter = self.filter.as_ref().map_or(Vec::new(), |it| it.to_bytes());
         [self.belief.to_bytes(), self.sightings.to_bytes(), filter].concat()
     }
 
@@ -237,7 +230,6 @@ fn predict_together(estimators: Vec<&mut dyn Estimator>) {
 }
 
 impl NeuralEstimator {
-    /// Adds one step to the ages of all sightings, and predicts the corrected filter one step ahead.
     fn advance(&mut self) {
         self.sightings.pass();
         if let Some(filter) = &mut self.filter {
@@ -246,8 +238,6 @@ impl NeuralEstimator {
         }
     }
 
-    /// Returns the key by which worlds are grouped into forward passes: the network, the grid, and whether the network
-    /// corrects a filter.
     fn pass_key(&self) -> (usize, [usize; 2], bool) {
         let (height, width) = self.sightings.shape().dim();
         (self.network.id(), [height, width], self.base.is_some())

@@ -88,7 +88,6 @@ pub struct StepSize {
 /// A setting's name, its value, and its minimum and maximum.
 pub(super) type Range<'a> = (&'a str, f64, f64, f64);
 
-/// Checks that all settings are within their ranges.
 pub(super) fn check(section: &str, settings: &[Range<'_>]) -> Result<()> {
     for &(name, got, least, most) in settings {
         if !(least..=most).contains(&got) {
@@ -115,8 +114,7 @@ impl LearningConfig {
         check("learning.", &ranges)
     }
 
-    /// Returns the factor that the step size is multiplied by at an update. It is 1 at first, then falls linearly to
-    /// `final_rate`.
+    /// Returns the factor of the step size at an update: 1 at first, then falling linearly to `final_rate`.
     pub fn rate_at(&self, update: u64) -> f64 {
         let fallen = update.saturating_sub(self.steady_updates) as f64;
         let share = 1.0 - fallen / self.falling_updates.max(1) as f64;
@@ -166,7 +164,6 @@ impl AutoencoderConfig {
     }
 }
 
-/// Checks the settings of a DQN. `most_kept` is the maximum capacity of the replay buffer, in transitions.
 fn check_dqn(section: &str, dqn: &DqnSettings, most_kept: f64) -> Result<()> {
     let batch = dqn.batch as f64;
     let ranges = [
@@ -251,15 +248,10 @@ mod tests {
         let quotients = [0, 5_000, 50_000, 500_000, 500_000_000].map(quotient);
         assert!(quotients.is_sorted_by(|a, b| a > b), "{quotients:?}");
         assert!(quotients[4] < 0.04 * quotients[0]);
-        let constant = AgentConfig::paper().autoencoder.step_size;
-        assert_eq!(constant.at(1_000_000), 1e-4);
-    }
-
-    #[test]
-    fn settings_reach_the_networks() {
-        let config = AgentConfig::paper();
-        assert_eq!(config.autoencoder.settings(), AutoencoderSettings::paper());
-        assert_eq!(config.dqn.settings(), DqnSettings::paper());
+        let paper = AgentConfig::paper();
+        assert_eq!(paper.autoencoder.step_size.at(1_000_000), 1e-4);
+        assert_eq!(paper.autoencoder.settings(), AutoencoderSettings::paper());
+        assert_eq!(paper.dqn.settings(), DqnSettings::paper());
     }
 
     #[test]

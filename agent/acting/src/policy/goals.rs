@@ -47,7 +47,6 @@ pub const GOALS: &[GoalEntry] = &[
     ),
 ];
 
-/// Goals of the planner `options`. Each option is a goal as well.
 pub(super) const OPTION_GOALS: &[GoalEntry] = &[
     (
         Goal::Rule,

@@ -42,7 +42,6 @@ pub fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
 /// Learned beliefs that are compared by default, each in its best variant (`docs/filters.md`).
 const LEARNED_BELIEFS: [&BeliefKind; 4] = [&LEARNED, &LEARNED_SPATIAL, &NEURAL, &AUTOENCODER];
 
-/// Returns the default policies for checkpoints: shooting and beam search on learned beliefs, and a DQN's decisions.
 fn of_learned(learned: &Learned, model: &Model) -> Vec<Policy> {
     use Goal::{Exploit, Explore};
     let mut all = Vec::new();

@@ -25,7 +25,6 @@ pub(super) const NAMED: &[(&str, &str)] = &[
     ("oracle_policy", "truth/options/rule"),
 ];
 
-/// Returns the name of the policy with the given parts.
 fn name(belief: &BeliefKind, planner: &'static PlannerKind, goal: Goal, model: &Model) -> String {
     let mut parts = format!("{}/{}", belief.name, planner.name);
     if !planner.goals.is_empty() {
@@ -73,10 +72,7 @@ impl Policy {
         }
     }
 
-    /// Parses a policy from its short name or the names of its parts.
-    ///
-    /// # Errors
-    /// If a part is unknown. The error lists the valid names.
+    /// Parses a short name or the names of the parts. The error lists the valid names.
     pub fn named(name: &str, model: &Model) -> Result<Self> {
         let states = model.state_names().join(", ");
         let parts = parse(name, &|state| model.state_named(state), &states);
@@ -84,10 +80,7 @@ impl Policy {
     }
 }
 
-/// Checks a policy's name without a model. Any word is accepted as the name of a state.
-///
-/// # Errors
-/// If the name is invalid under every model. The error lists the valid names.
+/// Checks a name without a model, with any word as the name of a state. The error lists the valid names.
 pub fn check_name(name: &str) -> Result<()> {
     // Any word can be the name of a state.
     let is_word = |state: &str| (!state.is_empty()).then_some(0);
@@ -101,8 +94,6 @@ pub fn planner_of(name: &str) -> Option<&'static PlannerKind> {
 
 type Parts = (&'static BeliefKind, &'static PlannerKind, Goal);
 
-/// Parses the parts of a policy. `state` returns the index of a state by its name. `states` lists the states' names for
-/// error messages.
 fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Result<Parts> {
     let short = NAMED.iter().find(|(short, _)| *short == name);
     let parts = short.map_or(name, |(_, parts)| parts);
@@ -134,7 +125,6 @@ fn parse(name: &str, state: &dyn Fn(&str) -> Option<usize>, states: &str) -> Res
     Ok((belief, planner, goal))
 }
 
-/// Returns the error for a name that is neither short nor made of parts.
 fn unknown(name: &str) -> String {
     let got = shortened(name);
     format!(
@@ -144,7 +134,6 @@ fn unknown(name: &str) -> String {
     )
 }
 
-/// Returns the goals that a planner accepts on a belief, besides options or the states of the model.
 fn goals(
     belief: &BeliefKind,
     planner: &PlannerKind,
@@ -177,7 +166,6 @@ fn goal_of(
     state.flatten().map(Goal::State)
 }
 
-/// Lists the names that [`goal_of`] accepts.
 fn goals_of(belief: &BeliefKind, planner: &PlannerKind, states: &str) -> String {
     if planner.goals.is_empty() {
         return "no goal".into();

@@ -20,7 +20,6 @@ use emberwatch_network::Dqn;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The text that observers see as the aim of a random path.
 const RANDOM_MOVES: &str = "random moves";
 
 const NO_TRUTH: &str = "the policy needs the truth channel: start the server with --publish-truth";
@@ -33,14 +32,11 @@ pub struct Agent {
     planner: Box<dyn Planner + Send>,
     options: OptionPlanner,
     pub memory: Memory,
-    /// The index, in the belief, of the state with the highest reward.
     target: usize,
-    /// Short description of the last path's purpose.
     aim: String,
     state_names: Vec<String>,
     n_moves: usize,
     seed: u64,
-    /// The cells that robots may fly over, and the range of their sensors.
     airspace: Airspace,
 }
 
@@ -160,7 +156,6 @@ impl Agent {
         proposal.plan
     }
 
-    /// Computes the layers of cell values from which options are planned.
     fn layers(&self) -> ValueLayers {
         let (belief, air) = (self.belief(), &self.airspace);
         ValueLayers::new(belief, air, self.target, &self.memory, self.n_moves)
@@ -270,15 +265,13 @@ impl Agent {
         Some(format!("{kind}; freshness [H, W] as f32, rewards, paths"))
     }
 
-    /// Encodes the agent's knowledge of its world before the frame of X_{k+1}: the estimator's state, and the agent's
-    /// memory.
+    /// Encodes the estimator's state and the agent's memory before the frame of X_{k+1}.
     pub fn handover(&self) -> Option<Vec<u8>> {
         let estimator = self.traits().handover?(&*self.estimator).to_bytes();
         Some([estimator, self.memory.to_bytes()].concat())
     }
 
-    /// Resumes from the handover bytes of an agent of the same kind. If they do not fit, returns false and changes
-    /// nothing.
+    /// Resumes from the handover of an agent of the same kind. Returns false and changes nothing if it does not fit.
     pub fn take_over(&mut self, bytes: &[u8]) -> bool {
         let shape = self.belief().shape();
         let Some(n_bytes) = bytes.len().checked_sub(Memory::n_bytes(shape)) else {

@@ -68,7 +68,6 @@ fn chooser(policy: &Policy, learned: &Learned, target: usize) -> Result<Chooser>
     })
 }
 
-/// Returns a function that chooses an objective with the DQN of Algorithm 1, which was trained with an autoencoder.
 fn decider(network: &AutoencoderModel) -> Decider {
     let choices = network_choices(network.autoencoder.shape().n_states).into_iter();
     let objectives = choices.map(|choice| choice.objective(network.target));

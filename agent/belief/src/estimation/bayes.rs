@@ -74,7 +74,6 @@ pub fn check(belief: &Belief, likelihood: &Array2<f64>, frame: &Frame) -> Result
     posteriors(belief, likelihood, frame).map(drop)
 }
 
-/// Returns the posterior of each observed cell, one cell after another.
 fn posteriors(
     belief: &Belief,
     likelihood: &Array2<f64>,

@@ -52,10 +52,7 @@ impl Belief {
         Self::everywhere(&initial, shape)
     }
 
-    /// Creates a belief with probability 1 for each cell's given state, shape `[H, W]`: the belief of an oracle.
-    ///
-    /// # Errors
-    /// If a state is not below `n_states`.
+    /// Creates an oracle's belief from states `[H, W]`, or returns an error if one is not below `n_states`.
     pub fn from_states(states: &Grid<u8>, n_states: usize) -> Result<Self, BeliefError> {
         let (height, width) = states.dim();
         let shape = Shape::new(height, width)?;
@@ -122,10 +119,7 @@ impl Belief {
         numbers.flat_map(|p| p.to_le_bytes()).collect()
     }
 
-    /// Creates a belief from the bytes of [`Self::to_bytes`].
-    ///
-    /// Returns `None` if the bytes do not fit the shape `dim`, `[S, H, W]`, or if [`Self::from_probabilities`] rejects
-    /// the values.
+    /// Decodes [`Self::to_bytes`]. `None` if the bytes do not fit `dim`, `[S, H, W]`, or are no valid belief.
     pub fn from_bytes(bytes: &[u8], dim: (usize, usize, usize)) -> Option<Self> {
         let (numbers, []) = bytes.as_chunks::<4>() else {
             return None;
@@ -155,10 +149,7 @@ impl Belief {
         self.probabilities.view()
     }
 
-    /// Returns the probability of one state in each cell, shape `[H, W]`.
-    ///
-    /// # Panics
-    /// If `state` is not below S.
+    /// Returns the probability of one state in each cell, shape `[H, W]`. Panics if `state` is not below S.
     pub fn probability(&self, state: usize) -> ArrayView2<'_, f32> {
         self.probabilities.index_axis(Axis(0), state)
     }
@@ -184,10 +175,7 @@ impl Belief {
         Grid::from_shape_vec(self.shape.dim(), entropy).expect("invariant: one value per cell")
     }
 
-    /// Draws each cell's state from the cell's own distribution, shape `[H, W]`.
-    ///
-    /// # Panics
-    /// If there are more than 256 states.
+    /// Draws each cell's state from its own distribution, shape `[H, W]`. Panics with more than 256 states.
     pub fn sample(&self, rng: &mut ChaCha8Rng) -> Grid<u8> {
         let (cells, n_states) = (0..self.shape.n_cells(), self.n_states());
         assert!(n_states <= 256, "belief: expected states that fit a byte");
@@ -224,12 +212,10 @@ impl Belief {
         slice.expect("invariant: beliefs are row-major")
     }
 
-    /// Returns a mutable array of the probabilities for estimators, which must keep each cell on the simplex.
     pub(crate) fn probabilities_mut(&mut self) -> &mut Probabilities {
         &mut self.probabilities
     }
 
-    /// Creates a belief with the same distribution in every cell.
     pub(crate) fn everywhere(distribution: &[f32], shape: Shape) -> Self {
         let (height, width) = shape.dim();
         let dim = (distribution.len(), height, width);
@@ -241,11 +227,9 @@ impl Belief {
     }
 }
 
-/// Computes the natural logarithm of a probability, with an error of a few units in the last place.
-///
-/// The result at 0 is finite, so that `p * ln(p)` is 0 there. The code has no branches or calls, so that the compiler
-/// vectorises the loop over cells. The argument is split into `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`. The
-/// polynomial in `m - 1` that approximates `ln(m)` is from `logf` of the Cephes library (S. Moshier).
+/// Finite at 0, so that `p * ln(p)` is 0 there. Without branches or calls, so that the loop over cells is vectorised.
+/// Splits `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`; the polynomial in `m - 1` is from `logf` of the Cephes library
+/// (S. Moshier).
 #[inline]
 fn ln(p: f32) -> f32 {
     const SQRT_HALF_BITS: u32 = 0x3f35_04f3;
@@ -278,15 +262,14 @@ mod tests {
     #[test]
     fn entropy_of_known_distributions() {
         let (uniform, ln3) = (Belief::uniform(3, shape(2, 5)), 3.0_f32.ln());
-        for (entropy, expected) in [
-            (uniform.entropy(), ln3),
-            (uniform.mean_entropy(), ln3 / 3.0),
-        ] {
-            assert!(
-                entropy.iter().all(|h| (h - expected).abs() < 1e-6),
-                "{entropy}"
-            );
-        }
+        let is_close = |h: &f32, expected: f32| (h - expected).abs() < 1e-6;
+        assert!(uniform.entropy().iter().all(|h| is_close(h, ln3)));
+        assert!(
+            uniform
+                .mean_entropy()
+                .iter()
+                .all(|h| is_close(h, ln3 / 3.0))
+        );
         let certain = Belief::from_states(&Grid::from_elem((2, 5), 1), 3).expect("valid states");
         assert!(certain.entropy().iter().all(|h| *h == 0.0));
     }

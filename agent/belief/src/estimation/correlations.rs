@@ -19,7 +19,6 @@ pub const RADIUS: usize = 4;
 /// Number of rows and of columns of a neighbourhood.
 pub const SIDE: usize = 2 * RADIUS + 1;
 
-/// Number of age ranges.
 pub(super) const N_AGES: usize = 8;
 
 /// The upper end of each age range in steps. The last range has no upper end.
@@ -45,7 +44,6 @@ const N_CLASSES: usize = (RADIUS + 1) * (RADIUS + 2) / 2;
 /// estimate for a pair of age ranges with little data stays close to this mean.
 const SHRINKAGE: f64 = 60.0;
 
-/// Maximum correlation between two cells.
 const LARGEST: f64 = 0.9;
 
 /// Upper bound of the sums in a valid file. No run observes enough pairs of cells to exceed it.
@@ -68,8 +66,7 @@ struct Sum {
     largest: f64,
 }
 
-/// The sums, indexed by the age range of the younger cell, the age range of the older cell, and the class of their
-/// offset.
+/// Indexed by the age ranges of the younger and of the older cell, and the class of their offset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Sums([[[Sum; N_CLASSES]; N_AGES]; N_AGES]);
 
@@ -81,7 +78,6 @@ pub struct Ages(Vec<u8>);
 #[derive(Debug, Clone)]
 pub struct Evidence {
     cell: Cell,
-    /// The range of the cell's age before the frame.
     age: usize,
     /// Posterior minus prior probability of the paying state.
     innovation: f64,
@@ -158,7 +154,6 @@ impl Sums {
 }
 
 impl Default for Correlations {
-    /// Returns the correlations before the first frame: zero between different cells, so that these are independent.
     fn default() -> Self {
         let mut correlations = Self {
             sums: Sums([[[Sum::default(); N_CLASSES]; N_AGES]; N_AGES]),
@@ -196,8 +191,7 @@ impl From<Correlations> for Sums {
 }
 
 impl Correlations {
-    /// Returns the correlations of a cell whose age is in range `age`. They are indexed by the neighbour's age range
-    /// and the [`class`] of the offset.
+    /// Returns the correlations of cells in age range `age`, by the other cell's age range and the offset's [`class`].
     pub fn of(&self, age: usize) -> &[[f32; N_CLASSES]; N_AGES] {
         &self.table[age]
     }
@@ -233,7 +227,6 @@ impl Correlations {
         }
     }
 
-    /// Computes the table from the sums.
     fn update(&mut self) {
         for younger in 0..N_AGES {
             for class in 1..N_CLASSES {

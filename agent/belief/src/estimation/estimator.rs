@@ -39,8 +39,7 @@ pub trait Filter: Estimator + ObservationModel + Handover {}
 
 impl<T: Estimator + ObservationModel + Handover> Filter for T {}
 
-/// An estimator whose state can be saved as bytes, and restored by another estimator of the same kind. Estimators are
-/// copied and handed over this way, too.
+/// An estimator whose state can be saved as bytes, and restored by another estimator of the same kind.
 pub trait Handover {
     /// Returns a description of the byte format. Only estimators with the same description can read the bytes.
     fn kind(&self) -> String;

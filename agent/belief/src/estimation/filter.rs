@@ -71,7 +71,6 @@ impl BayesFilter {
         }
     }
 
-    /// Updates the cavities after a correction of the belief.
     pub(super) fn correct_cavities(&mut self) {
         if self.prediction.has_cavities() {
             self.prediction
@@ -81,12 +80,10 @@ impl BayesFilter {
         }
     }
 
-    /// Returns the number of bytes of [`Handover::to_bytes`].
     pub(super) fn n_bytes(&self) -> usize {
         4 * self.belief.as_slice().len() + self.prediction.n_bytes()
     }
 
-    /// Returns the belief and `P(y | x)`, shape `[S, O]`.
     pub(super) fn parts(&self) -> (&Belief, &Array2<f64>) {
         (&self.belief, &self.likelihood)
     }
@@ -97,8 +94,6 @@ impl BayesFilter {
 }
 
 impl Estimator for BayesFilter {
-    /// # Panics
-    /// If the frame's grid differs from the belief's, or the model lacks one of the frame's observations.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         correct(&mut self.belief, &self.likelihood, frame)?;
         self.correct_cavities();
@@ -172,7 +167,6 @@ fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32
 #[cfg(test)]
 mod tests {
     use super::*;
-    use emberwatch_model::Probabilities;
     use emberwatch_model::grid::Shape;
 
     #[test]
@@ -202,20 +196,5 @@ mod tests {
 
     fn frame(shape: Shape, values: &[u8]) -> Frame {
         Frame::from_bytes(shape, 3, values).expect("test frame")
-    }
-
-    #[test]
-    fn a_tiny_probability_does_not_count_as_zero() {
-        let shape = Shape::new(1, 1).expect("test shape");
-        let numbers = [1.0, 0.0, f32::MIN_POSITIVE];
-        let numbers = Probabilities::from_shape_fn((3, 1, 1), |(state, _, _)| numbers[state]);
-        let prior = Belief::from_probabilities(numbers).expect("valid");
-        let mut file = Model::wildfire().file().clone();
-        file.states[0].observed_as = vec![1.0, 0.0, 0.0];
-        file.states[2].observed_as = vec![0.999, 0.0005, 0.0005];
-        let mut filter =
-            BayesFilter::known(&Model::new(file).expect("valid"), prior, false).expect("valid");
-        filter.correct(&frame(shape, &[2])).expect("possible");
-        assert_eq!(filter.belief().probability(2)[[0, 0]], 1.0);
     }
 }

@@ -2,7 +2,6 @@
 
 use ndarray::Array2;
 
-/// Lower bound on variances that are used as denominators.
 const LEAST_VARIANCE: f64 = 1e-9;
 
 /// The effect of an observation on the probability of one state of the observed cell.

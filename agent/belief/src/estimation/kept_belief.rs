@@ -13,7 +13,6 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
-/// Maximum number of cached files.
 const MAX_FILES: usize = 32;
 
 /// Maximum size of a cached belief in bytes: 512 x 512 cells with four states.
@@ -21,10 +20,8 @@ const MAX_BYTES: usize = 4 << 20;
 
 const CHECKSUM_BYTES: usize = 4;
 
-/// Maximum time to wait for a process that makes the same belief.
 const LONGEST_WAIT: Duration = Duration::from_secs(300);
 
-/// Interval between two attempts to lock.
 const PAUSE: Duration = Duration::from_millis(20);
 
 /// The right to make a belief. It ends with its process, unless a forked child has a copy of the descriptor.
@@ -132,9 +129,6 @@ impl KeptBelief {
     }
 
     /// Writes the belief for later runs, and removes the oldest files beyond the maximum number.
-    ///
-    /// # Errors
-    /// If the folder or the file cannot be written.
     pub fn write(&self, belief: &Belief) -> std::io::Result<()> {
         let mut bytes = self.key.clone().into_bytes();
         let values = belief.probabilities().iter();
@@ -213,46 +207,43 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     #[test]
-    fn only_beliefs_up_to_the_maximum_size_are_cached() {
-        // This model has four states.
-        let model = Model::built_in("road-ice").expect("built in");
-        let is_kept = |width| {
-            let shape = Shape::new(512, width).expect("test shape");
-            KeptBelief::new(Prior::Initial, &model, shape, 0).is_some()
-        };
+    fn every_input_of_a_small_belief_changes_its_file_name() {
         assert!(cache_folder().is_some(), "HOME must be set");
-        assert_eq!([512, 513].map(is_kept), [true, false]);
-    }
-
-    #[test]
-    fn every_input_of_a_belief_changes_its_file_name() {
-        let kept = |seed, n_worlds, (height, width)| {
+        let kept = |model, seed, n_worlds, (height, width)| {
             let shape = Shape::new(height, width).expect("test shape");
             let burn_in = 40;
             let prior = Prior::Simulated { n_worlds, burn_in };
-            KeptBelief::new(prior, &Model::wildfire(), shape, seed).expect("small")
+            let model = Model::built_in(model).expect("built in");
+            KeptBelief::new(prior, &model, shape, seed).map(|it| it.path)
         };
-        let names = [
-            kept(0, 9, (5, 7)),
-            kept(1, 9, (5, 7)),
-            kept(0, 8, (5, 7)),
-            kept(0, 9, (7, 5)),
+        let inputs = [
+            ("wildfire", 0, 9, (5, 7)),
+            ("wildfire", 1, 9, (5, 7)),
+            ("wildfire", 0, 8, (5, 7)),
+            ("wildfire", 0, 9, (7, 5)),
+            ("road-ice", 0, 9, (512, 512)),
         ];
-        let names = names.map(|it| it.path);
-        for (at, name) in names.iter().enumerate() {
-            assert!(!names[..at].contains(name), "{names:?}");
+        let paths =
+            || inputs.map(|(model, seed, n, dim)| kept(model, seed, n, dim).expect("small"));
+        let distinct: std::collections::BTreeSet<_> = paths().into();
+        assert_eq!(distinct.len(), inputs.len());
+        assert_eq!(paths(), paths(), "equal inputs");
+        // This model has four states.
+        assert_eq!(kept("road-ice", 0, 9, (512, 513)), None, "too large");
+    }
+
+    fn kept(folder: &tempfile::TempDir, key: &str) -> KeptBelief {
+        KeptBelief {
+            path: folder.path().join("new/a.belief"),
+            key: key.into(),
+            dim: (3, 1, 2),
         }
-        assert_eq!(kept(0, 9, (5, 7)).path, names[0]);
     }
 
     #[test]
     fn only_intact_files_with_the_same_key_are_read() {
         let folder = tempfile::TempDir::new().expect("a folder");
-        let kept = |key: &str| KeptBelief {
-            path: folder.path().join("new/a.belief"),
-            key: key.into(),
-            dim: (3, 1, 2),
-        };
+        let kept = |key| kept(&folder, key);
         let belief = Belief::uniform(3, Shape::new(1, 2).expect("test shape"));
         assert_eq!(kept("key").read(), None, "no file yet");
         kept("key").write(&belief).expect("written");
@@ -279,11 +270,7 @@ mod tests {
     #[test]
     fn one_makes_a_belief_and_the_others_wait() {
         let folder = tempfile::TempDir::new().expect("a folder");
-        let kept = KeptBelief {
-            path: folder.path().join("new/a.belief"),
-            key: "key".into(),
-            dim: (3, 1, 2),
-        };
+        let kept = kept(&folder, "key");
         let belief = Belief::uniform(3, Shape::new(1, 2).expect("test shape"));
         let n_made = AtomicUsize::new(0);
         let pause = |time| -> Result<(), String> {
@@ -315,21 +302,14 @@ mod tests {
     #[test]
     fn the_oldest_files_are_removed() {
         let folder = tempfile::TempDir::new().expect("a folder");
-        for (name, seconds) in [
-            ("a.belief", 20),
-            ("b.belief", 10),
-            ("c.belief", 30),
-            ("d.lock", 1),
-        ] {
+        let names = ["a.belief", "b.belief", "c.belief", "d.lock"];
+        for (name, seconds) in names.into_iter().zip([20, 10, 30, 1]) {
             let file = File::create(folder.path().join(name)).expect("a file");
             let changed = SystemTime::UNIX_EPOCH + Duration::from_secs(seconds);
             file.set_modified(changed).expect("a time");
         }
         remove_oldest(folder.path(), 2);
-        let is_there = |name| folder.path().join(name).exists();
-        assert_eq!(
-            ["a.belief", "b.belief", "c.belief", "d.lock"].map(is_there),
-            [true, false, true, true]
-        );
+        let left = names.map(|name| folder.path().join(name).exists());
+        assert_eq!(left, [true, false, true, true]);
     }
 }

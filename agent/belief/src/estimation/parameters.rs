@@ -11,24 +11,19 @@ use emberwatch_model::{MAX_KERNEL_SIDE, MAX_VALUES, Shape};
 use ndarray::{Array2, Array4};
 use serde::{Deserialize, Serialize};
 
-/// Maximum magnitude of an unconstrained value. With this bound, weights are at least 1e-7 and probabilities at least
-/// 1e-14.
+/// Maximum magnitude of an unconstrained value: weights are at least 1e-7, and probabilities at least 1e-14.
 pub const BOUND: f32 = 16.0;
 
-/// Initial weight of a transition in which a cell keeps its state. The initial weights are chosen for states that
-/// persist and spread.
+/// The initial weights are chosen for states that persist and spread.
 const OWN_WEIGHT: f64 = 1.0;
-/// Initial weight of a transition in which a cell adopts a neighbour's state.
 const NEIGHBOUR_WEIGHT: f64 = 0.1;
 /// Initial weight of all other transitions, as a fraction of the two weights above.
 const OTHER_STATE: f64 = 0.005;
 
-/// Initial logit of the observation with the same index as the state. With three observations, its initial probability
-/// is 0.86.
+/// With three observations, the initial probability of a state's own observation is 0.86.
 const OWN_OBSERVATION: f32 = 2.5;
 
-/// Amplitude of the noise on the initial logits, and of the relative noise on the initial weights. Without noise,
-/// states that share an observation would learn the same parameters.
+/// Without noise, states that share an observation would learn the same parameters.
 const NOISE: f32 = 0.1;
 
 /// The dimensions of a learned filter.
@@ -62,10 +57,7 @@ pub struct Tables {
 }
 
 impl Dimensions {
-    /// Checks the dimensions against the limits of a model, and returns them.
-    ///
-    /// # Errors
-    /// If a dimension is out of range. The error names the first such dimension.
+    /// Returns the dimensions. An error names the first that is out of a model's range.
     pub fn check(self) -> Result<Self, String> {
         let counts = [
             ("states", 2, self.n_states),
@@ -277,14 +269,9 @@ mod tests {
         }
         assert!(tables.kernel.iter().all(|&w| w > 0.0));
         assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
-        check_chain_rule(dimensions());
-    }
-
-    /// Checks gradients against finite differences.
-    fn check_chain_rule(dimensions: Dimensions) {
-        let parameters = Parameters::first(dimensions, 3);
+        let parameters = Parameters::first(dimensions(), 3);
         // The function to differentiate: a linear function of the tables with arbitrary factors.
-        let factors: [Vec<f64>; 3] = dimensions.lengths().map(|length| {
+        let factors: [Vec<f64>; 3] = dimensions().lengths().map(|length| {
             let factor = |index| (index as f64 * 0.7).sin();
             (0..length).map(factor).collect()
         });
@@ -315,17 +302,14 @@ mod tests {
 
     #[test]
     fn dimensions_out_of_range_are_named() {
-        type Change = fn(&mut Dimensions);
-        let changes: [(Change, &str); 3] = [
-            (|it| it.n_states = 1, "states: expected 2 to 64, got 1"),
-            (|it| it.n_observations = 65, "got 65"),
-            (|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2"),
-        ];
-        for (change, words) in changes {
+        let refused = |change: fn(&mut Dimensions), words: &str| {
             let mut dimensions = dimensions();
             change(&mut dimensions);
             let error = dimensions.check().expect_err(words);
             assert!(error.contains(words), "{error}");
-        }
+        };
+        refused(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
+        refused(|it| it.n_observations = 65, "got 65");
+        refused(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
     }
 }

@@ -73,8 +73,7 @@ impl Prediction {
         Self(Kind::ratio(transition, belief))
     }
 
-    /// Returns whether there are cavities. If so, [`Self::correct`] must update them after each correction of the
-    /// belief.
+    /// Returns whether there are cavities, which [`Self::correct`] must then update after each correction.
     pub fn has_cavities(&self) -> bool {
         self.n_bytes() > 0
     }
@@ -87,8 +86,7 @@ impl Prediction {
         }
     }
 
-    /// Returns the cavities, each `[S, H, W]`, row-major, as little-endian `f32`. If there are no cavities, the result
-    /// is empty.
+    /// Returns the cavities, each `[S, H, W]`, row-major, as little-endian `f32`; empty if there are none.
     pub fn to_bytes(&self) -> Vec<u8> {
         match &self.0 {
             Kind::Ratio { .. } => Vec::new(),

@@ -26,7 +26,6 @@ const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::c
 #[derive(Debug, Clone)]
 pub struct SpatialFilter {
     filter: BayesFilter,
-    /// The state for which corrections are spread to neighbours.
     state: usize,
     correlations: Correlations,
     ages: Ages,
@@ -106,8 +105,6 @@ impl SpatialFilter {
 }
 
 impl Estimator for SpatialFilter {
-    /// # Panics
-    /// If the frame's grid differs from the belief's.
     fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         let (dim, expected) = (frame.values().dim(), self.belief().shape().dim());
         assert_eq!(dim, expected, "frame: expected the belief's grid");

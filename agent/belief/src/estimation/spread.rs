@@ -10,10 +10,8 @@ use emberwatch_model::{Cell, Shape};
 /// the probability of the paying state stays between `LEAST` and `1 - LEAST`.
 const LEAST: f32 = 1e-5;
 
-/// Index of the seen cell in its own patch.
 const CENTRE: usize = RADIUS * WIDTH + 2 * RADIUS;
 
-/// The [`class`] of each offset in a neighbourhood, by row and column.
 const CLASSES: [[usize; SIDE]; SIDE] = {
     let mut classes = [[0; SIDE]; SIDE];
     let mut at = 0;
@@ -25,7 +23,6 @@ const CLASSES: [[usize; SIDE]; SIDE] = {
     classes
 };
 
-/// Length of a row of a [`Patch`]: the side of a neighbourhood, and a margin at either end.
 const WIDTH: usize = SIDE + 2 * RADIUS;
 
 /// Covariances of a seen cell with each cell of its neighbourhood, row-major. Each row has margins, so that a single
@@ -37,9 +34,7 @@ type Patch = [f32; WIDTH * SIDE];
 #[derive(Debug, Clone)]
 pub struct Spread {
     shape: Shape,
-    /// The state for which corrections are spread to neighbours.
     state: usize,
-    /// Length of a row with its margins.
     stride: usize,
     probability: Vec<f32>,
     /// For each cell, the standard deviation of "the cell is in the paying state" (1 or 0) before the frame.
@@ -109,7 +104,6 @@ impl Spread {
         self.patches = patches.collect();
     }
 
-    /// Computes the covariances of a cell with its neighbourhood before the frame.
     fn patch(&self, cell: Cell, correlations: &Correlations) -> Patch {
         let own = self.deviation[self.place(cell)];
         let age = self.ages[self.place(cell)];
@@ -162,7 +156,6 @@ impl Spread {
         self.seen[index].posterior = posterior;
     }
 
-    /// Implements [`Self::spread`], given the posterior probability of the paying state.
     #[inline(always)] // So that `vectorised` compiles it for this processor's vector instructions.
     fn correct(&mut self, index: usize, innovation: &Innovation, posterior: f32) {
         let cell = self.seen[index].cell;
@@ -230,16 +223,12 @@ impl Spread {
         (cell.row + RADIUS) * self.stride + cell.col + RADIUS
     }
 
-    /// Returns the index of the upper left cell of a neighbourhood.
     fn corner(&self, cell: Cell) -> usize {
         cell.row * self.stride + cell.col
     }
 }
 
-/// Sets the probability of one state to `now`, and rescales the other states in proportion.
-///
-/// The updated cells are the first `now.len()` cells of each state. A cell whose other states all have probability 0 is
-/// left unchanged.
+/// A cell whose other states all have probability 0 is left unchanged.
 #[inline(always)]
 fn set_state(numbers: &mut [f32], n_cells: usize, state: usize, now: &[f32]) {
     let own = state * n_cells;
@@ -266,8 +255,7 @@ fn set_state(numbers: &mut [f32], n_cells: usize, state: usize, now: &[f32]) {
     }
 }
 
-/// Updates the covariances of a patch after another cell was seen. The patch lies `down` rows and `across` columns from
-/// the patch of the seen cell.
+/// The patch lies `down` rows and `across` columns from the patch of the seen cell.
 #[inline(always)]
 fn reduce(patch: &mut Patch, seen: &Patch, share: f64, (down, across): (isize, isize)) {
     let offset = down * WIDTH as isize + across;

@@ -17,10 +17,7 @@ const DISCOUNT: f32 = 0.8;
 pub struct Ahead(BeamSearch);
 
 impl Ahead {
-    /// Creates a planner with a beam of `width` states.
-    ///
-    /// # Panics
-    /// If `width` is 0.
+    /// Creates a planner with a beam of `width` states, at least 1.
     pub fn new(width: usize) -> Self {
         Self(BeamSearch::new(width))
     }
@@ -45,9 +42,7 @@ impl Planner for Ahead {
     }
 }
 
-/// Computes for each cell the maximum of the values of all cells, discounted by distance, shape `[H, W]`: each move on
-/// the way to another cell multiplies that cell's value by `kept_per_move`. This guides the search in regions where all
-/// values are equal.
+/// Each move towards a cell multiplies its value by `kept_per_move`. Guides the search where all values are equal.
 fn promise(values: &CellValues, kept_per_move: f32) -> Grid<f32> {
     let mut promise = values.worth().mapv(|value| value.max(0.0));
     let airspace = values.airspace();

@@ -10,7 +10,6 @@ use crate::planning::reach::Reach;
 use emberwatch_model::path::Move;
 use emberwatch_model::randomness::split_mix;
 
-/// Default key of the cells' hash values: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
 
 /// The default width.
@@ -25,7 +24,6 @@ pub const DEFAULT_WIDTH: usize = 50;
 pub struct BeamSearch {
     width: usize,
     hash_key: u64,
-    /// Discount from each move to the next.
     discount: f32,
     /// Weight of the next move's cell: a power of the discount.
     weight: f32,
@@ -43,31 +41,25 @@ pub struct BeamSearch {
     seen_cells: Vec<u64>,
     next_seen_cells: Vec<u64>,
     candidates: Vec<Candidate>,
-    /// The rank and the index of each candidate.
     ranking: Vec<(u64, u32)>,
     seen: SeenStates,
-    /// For each move, the origins of the states in the beam after that move.
     history: Vec<Origin>,
 }
 
-/// A partial path that the search may extend.
 #[derive(Debug, Clone, Copy)]
 struct State {
     row: u32,
     col: u32,
     score: f32,
-    /// Hash of the set of visited cells.
     hash: u64,
 }
 
-/// A successor of a state in the beam.
 #[derive(Debug, Clone, Copy)]
 struct Candidate {
     state: State,
     origin: Origin,
 }
 
-/// The origin of a state in the beam: the index of the previous state, and the move from there.
 #[derive(Debug, Clone, Copy)]
 struct Origin {
     state: u32,
@@ -81,10 +73,7 @@ impl Default for BeamSearch {
 }
 
 impl BeamSearch {
-    /// Creates a search that keeps `width` states.
-    ///
-    /// # Panics
-    /// If `width` is 0.
+    /// Creates a search that keeps `width` states, at least 1.
     pub fn new(width: usize) -> Self {
         assert!(
             width > 0,
@@ -116,8 +105,7 @@ impl BeamSearch {
         self.cell_hashes.clear();
     }
 
-    /// Sets the discount: the cell of each move counts `discount` times as much as the cell of the previous move. The
-    /// default is 1.
+    /// Makes the cell of each move count `discount` times as much as that of the previous move.
     pub fn set_discount(&mut self, discount: f32) {
         self.discount = discount;
     }
@@ -137,7 +125,6 @@ impl BeamSearch {
         Some(if is_greedy { greedy } else { plan })
     }
 
-    /// Returns the best path that a beam of the given width finds in the reach, or `None` if `stops` returns true.
     fn search(
         &mut self,
         width: usize,
@@ -172,7 +159,6 @@ impl BeamSearch {
             .extend(missing.map(|index| split_mix(self.hash_key, index)));
     }
 
-    /// Makes the start the only state of the beam.
     fn reset(&mut self, width: usize) {
         let n_words = self.words_per_state();
         self.visited.clear();
@@ -204,7 +190,6 @@ impl BeamSearch {
         sight.map_or(0, |sight| sight.n_cells().div_ceil(64))
     }
 
-    /// Lists the successors of the beam's states, each distinct state once with its best score.
     fn expand(&mut self, was_seen: bool) {
         self.candidates.clear();
         self.seen.clear();
@@ -229,7 +214,6 @@ impl BeamSearch {
         }
     }
 
-    /// Returns the successor of a state of the beam after a move, and the hash of the successor's cell and visited set.
     #[inline]
     fn successor(&self, index: usize, step: Move) -> (Candidate, u64) {
         let before = self.beam[index];
@@ -252,7 +236,6 @@ impl BeamSearch {
         (Candidate { state, origin }, key)
     }
 
-    /// Ranks the candidates and keeps the best `width`.
     fn rank(&mut self, width: usize) {
         let rank = |(index, candidate): (usize, &Candidate)| {
             let State { score, hash, .. } = candidate.state;
@@ -269,7 +252,6 @@ impl BeamSearch {
         }
     }
 
-    /// Replaces the beam with the best candidates.
     fn select(&mut self, width: usize, was_seen: bool) {
         self.rank(width);
         let (n_words, n_seen) = (self.words_per_state(), self.seen_words_per_state());
@@ -304,7 +286,6 @@ impl BeamSearch {
         std::mem::swap(&mut self.seen_cells, &mut self.next_seen_cells);
     }
 
-    /// Returns the moves that led to a state of the last beam.
     fn moves_to(&self, state: usize, width: usize, n_moves: usize) -> Vec<Move> {
         let mut moves = vec![Move::Up; n_moves];
         let mut state = state;
@@ -324,15 +305,13 @@ impl Planner for BeamSearch {
     }
 }
 
-/// Converts a score to bits that, as unsigned integers, sort in the same order as the scores.
 fn ordered_bits(score: f32) -> u32 {
     let bits = score.to_bits();
     // The bits of negative scores sort in reverse order, and above the bits of positive scores.
     bits ^ if bits >> 31 == 1 { u32::MAX } else { 1 << 31 }
 }
 
-/// The distinct states among the candidates of one move, as a hash table whose keys are already hashes. Incrementing
-/// the round clears the table without a write to each slot.
+/// Keys are already hashes. Incrementing the round clears the table without a write to each slot.
 #[derive(Debug)]
 struct SeenStates {
     /// The key, the round of its insertion, and the index of its candidate.
@@ -355,7 +334,6 @@ impl SeenStates {
         }
     }
 
-    /// Returns the candidate of a key. If the key is new, inserts it with `candidate` and returns `None`.
     #[inline]
     fn find_or_insert(&mut self, key: u64, candidate: usize) -> Option<usize> {
         let mask = self.slots.len() - 1;
@@ -407,12 +385,5 @@ mod tests {
             });
             assert_eq!(search.beam.len(), expected.len(), "{shape}");
         }
-    }
-
-    #[test]
-    fn ordered_bits_keep_the_order_of_scores() {
-        let infinity = f32::INFINITY;
-        let numbers = [-infinity, -2.0, -1e-30, 0.0, 1e-30, 1.0, 3.0, infinity];
-        assert!(numbers.map(ordered_bits).is_sorted());
     }
 }

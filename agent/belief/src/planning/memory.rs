@@ -5,14 +5,12 @@ use emberwatch_model::{Frame, Grid, Shape};
 /// Number of steps in which the freshness of a cell decays to `1/e`.
 const FADING_STEPS: f32 = 300.0;
 
-/// Weight of the latest reward in the running mean.
 const LATEST_SHARE: f32 = 0.2;
 
 /// The freshness of each cell, and recent rewards.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Memory {
-    /// `exp(-age / 300)` of each cell, where `age` is the number of steps since the cell was last seen. 0 if it was
-    /// never seen.
+    /// `exp(-age / 300)`, with the steps since the cell was last seen as its age. 0 if it was never seen.
     freshness: Grid<f32>,
     pub recent: Recent,
 }
@@ -99,7 +97,6 @@ impl Memory {
         memory.is_of(shape).then_some(memory)
     }
 
-    /// Returns whether the memory fits a grid and all its values are valid.
     fn is_of(&self, shape: Shape) -> bool {
         let rewards = [self.recent.last_reward, self.recent.mean_reward];
         self.freshness.dim() == shape.dim()
@@ -139,8 +136,9 @@ mod tests {
     #[test]
     fn rewards_are_remembered_per_move() {
         let mut memory = Memory::new(Shape::new(1, 1).expect("test shape"));
-        memory.earn(6.0, 12);
-        memory.earn(0.0, 12);
+        [6.0, 0.0]
+            .into_iter()
+            .for_each(|reward| memory.earn(reward, 12));
         let recent = memory.recent;
         assert_eq!((recent.last_reward, recent.n_paths), (0.0, 2));
         assert!((recent.mean_reward - 0.08).abs() < 1e-6);

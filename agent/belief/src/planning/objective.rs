@@ -27,10 +27,7 @@ pub enum Target {
 }
 
 impl Target {
-    /// Returns a one-word label for display. `states` are the names of the belief's states.
-    ///
-    /// # Panics
-    /// If a state has no name.
+    /// Returns a one-word label for display. `states` are the names of all states of the belief.
     pub fn label(self, states: &[String]) -> String {
         match self {
             Self::State(state) => states[state].clone(),
@@ -51,7 +48,6 @@ pub struct Objective {
 /// The value that a planner assigns to each cell of the grid. All values are finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellValues {
-    /// The value of a cell on the path.
     value: Grid<f32>,
     coverage_bonus: f32,
     /// The value of each cell in sight of the path. `None` if only cells on the path count, or if the sensor sees no
@@ -79,8 +75,7 @@ impl Objective {
         }
     }
 
-    /// Computes the cells' values under a belief, on a grid without no-fly cells and with a sensor that sees only the
-    /// path.
+    /// Computes the cells' values under a belief, without no-fly cells and with a sensor that sees only the path.
     pub fn values(&self, belief: &Belief) -> CellValues {
         self.values_in(belief, &Airspace::open(belief.shape()))
     }
@@ -230,13 +225,11 @@ impl CellValues {
         score
     }
 
-    /// Computes the part of a path's score that comes from cells in sight.
     fn seen_score(&self, start: Cell, moves: &[Move]) -> f32 {
         let Some(in_sight) = &self.in_sight else {
             return 0.0;
         };
-        let in_sight = in_sight.as_slice();
-        let in_sight = in_sight.expect("invariant: grids are row-major");
+        let in_sight = in_sight.as_slice().expect("invariant: grids are row-major");
         let visited = self.airspace.fly(start, moves).visited;
         let seen = self.airspace.see(&visited);
         seen.iter().map(|&cell| in_sight[cell]).sum()

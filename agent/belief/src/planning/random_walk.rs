@@ -5,8 +5,7 @@ use emberwatch_model::path::Move;
 use emberwatch_model::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 
-/// A planner that draws moves uniformly and independently, regardless of the cells' values. The planner avoids no-fly
-/// cells.
+/// A planner that draws moves uniformly and independently, and avoids no-fly cells.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RandomWalk;
 

@@ -6,10 +6,8 @@ use emberwatch_model::grid::Cell;
 use emberwatch_model::path::Move;
 use std::ops::Range;
 
-/// The rectangle of cells within T rows and T columns of the start of a path of T moves, and the values of these cells.
-///
-/// No path of T moves crosses a border of the reach that lies inside the grid. Clamping moves to the reach therefore
-/// has the same effect as clamping them to the grid.
+/// The cells within T rows and columns of a path's start. No path of T moves crosses a border of the reach inside the
+/// grid, so clamping moves to the reach has the same effect as clamping them to the grid.
 #[derive(Debug, Default)]
 pub(super) struct Reach {
     pub rows: usize,
@@ -22,13 +20,11 @@ pub(super) struct Reach {
     pub sight: Option<Sight>,
 }
 
-/// The cells in sight of a [`Reach`], and their values when seen for the first time.
 #[derive(Debug)]
 pub(super) struct Sight {
     radius: usize,
     rows: usize,
     cols: usize,
-    /// Row and column of the reach's upper left cell.
     first: (usize, usize),
     values: Vec<f32>,
 }
@@ -86,8 +82,7 @@ impl Reach {
         row as usize * self.cols + col as usize
     }
 
-    /// Returns the cell after a move. A move out of the reach leaves the robot in place, as [`Move::apply`] does on the
-    /// grid.
+    /// Returns the cell after a move. A move out of the reach leaves the robot in place.
     #[inline]
     pub fn after(&self, step: Move, row: u32, col: u32) -> (u32, u32) {
         match step {

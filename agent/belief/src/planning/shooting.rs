@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 /// The paper's N: 2048 samples.
 pub const PAPER_SAMPLES: usize = 2048;
 
-/// Number of moves in one word of random bits.
 const MOVES_PER_WORD: usize = 32;
 
 /// Number of samples whose positions are computed in parallel: two SSE registers of `i16`.
@@ -47,12 +46,9 @@ pub struct Shooting {
     cells: Vec<[(i16, i16); LANES]>,
 }
 
-/// A cell of the reach, with all data that the scoring of a visit reads or writes.
 #[derive(Debug, Clone, Copy)]
 struct Slot {
-    /// The gains of the first and of a later visit, as in [`Reach::gains`].
     gains: [f32; 2],
-    /// The number of the last sample that visited the cell.
     stamp: u32,
 }
 
@@ -85,10 +81,7 @@ impl Integration {
 }
 
 impl Shooting {
-    /// Creates a planner that draws `n_samples` samples.
-    ///
-    /// # Panics
-    /// If `n_samples` is 0.
+    /// Creates a planner that draws `n_samples` samples, at least 1.
     pub fn new(n_samples: usize, integration: Integration) -> Self {
         assert!(
             n_samples > 0,
@@ -105,8 +98,7 @@ impl Shooting {
         }
     }
 
-    /// Creates the planner of the authors' code, with 2048 samples and clamped sums. Its objective is
-    /// [`super::Objective::paper`].
+    /// Creates the planner of the authors' code. Its objective is [`super::Objective::paper`].
     pub fn paper() -> Self {
         Self::new(PAPER_SAMPLES, Integration::ClampSum)
     }
@@ -124,8 +116,6 @@ impl Shooting {
         self.cells.resize(problem.n_moves, [(0, 0); LANES]);
     }
 
-    /// Computes the cells of [`LANES`] samples. Each move takes two bits, from the low end of each word.
-    ///
     /// All lanes do the same arithmetic on `i16`, which the compiler translates into vector instructions.
     fn integrate<const CLAMP_SUM: bool>(&mut self) {
         let Reach {
@@ -157,8 +147,6 @@ impl Shooting {
         }
     }
 
-    /// Computes the score of the sample in one lane.
-    ///
     /// Whether a cell is new is as unpredictable as the moves, so a branch makes the loop 3.5 times slower (measured).
     /// The compiler would turn an `if` or a mask into a branch, so the code uses the condition as an index.
     fn score(&mut self, lane: usize) -> f32 {
@@ -173,7 +161,6 @@ impl Shooting {
         score
     }
 
-    /// Returns the random bits of the best sample, and its score.
     fn best<const CLAMP_SUM: bool>(&mut self, problem: &PlanningProblem<'_>) -> (Vec<u64>, f32) {
         let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
         let n_words = self.words.len() / LANES;

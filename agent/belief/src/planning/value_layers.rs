@@ -8,7 +8,6 @@ use ndarray::Zip;
 /// Radius of a region. A region contains all cells of the grid within this number of rows and columns of its centre.
 pub const REGION_RADIUS: usize = 6;
 
-/// Distance between the centres of the regions that are compared, in rows and in columns.
 const CENTRE_STRIDE: usize = 4;
 
 /// Probability of the paying state above which a cell is worth flying to.
@@ -88,14 +87,12 @@ impl ValueLayers {
         layers.cleared(&closed.map(|(cell, _)| cell).collect::<Vec<_>>(), &[])
     }
 
-    /// Sets layers to 0 in the cells that another robot visits. Layers that count in all cells in sight are set to 0 in
-    /// the cells that the other robot sees.
+    /// Sets layers to 0 in the cells that another robot visits, or, if they count in sight, sees.
     pub fn without(self, visited: &[usize]) -> Self {
         let seen = self.airspace.see(visited);
         self.cleared(visited, &seen)
     }
 
-    /// Sets layers to 0 in `visited` cells, or in `seen` cells if they count in all cells in sight.
     fn cleared(mut self, visited: &[usize], seen: &[usize]) -> Self {
         for layer in Layer::ALL {
             let in_sight = self.counts_in_sight(layer);
@@ -201,20 +198,16 @@ impl Sums {
 mod tests {
     use super::*;
 
-    fn layers(height: usize, width: usize) -> ValueLayers {
-        let shape = Shape::new(height, width).expect("test shape");
-        let random = |(row, col)| {
-            (emberwatch_model::randomness::split_mix(row as u64, col as u64) % 3) as u8
-        };
-        let states = Grid::from_shape_fn((height, width), random);
-        let belief = Belief::from_states(&states, 3).expect("valid states");
-        ValueLayers::new(&belief, &Airspace::open(shape), 2, &Memory::new(shape), 12)
-    }
-
     #[test]
     fn sums_around_a_cell_agree_with_plain_sums() {
         for (height, width) in [(1, 1), (3, 20), (20, 15), (64, 64)] {
-            let layers = layers(height, width);
+            let shape = Shape::new(height, width).expect("test shape");
+            let states = Grid::from_shape_fn((height, width), |(row, col)| {
+                (emberwatch_model::randomness::split_mix(row as u64, col as u64) % 3) as u8
+            });
+            let belief = Belief::from_states(&states, 3).expect("valid states");
+            let open = Airspace::open(shape);
+            let layers = ValueLayers::new(&belief, &open, 2, &Memory::new(shape), 12);
             let cells = |layer| layers.layer(layer).indexed_iter();
             for centre in layers.centres().chain([layers.shape().cell(0)]) {
                 let near = |(row, col): (usize, usize)| {

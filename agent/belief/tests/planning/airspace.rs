@@ -1,6 +1,6 @@
 //! Tests plans with no-fly cells and with cells in sight of the path, against an enumeration of all paths.
 
-use super::fields::Field;
+use super::fields::{Field, RANDOM};
 use emberwatch_belief::planning::team::plan_team;
 use emberwatch_belief::planning::{
     Ahead, BeamSearch, Integration, Memory, OPTIONS, Objective, OptionPlanner, Planner, RandomWalk,
@@ -9,7 +9,6 @@ use emberwatch_belief::planning::{
 use emberwatch_model::randomness::split_mix;
 use emberwatch_model::{Airspace, Cell, Grid, Move, Shape};
 use proptest::prelude::*;
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// Closes a quarter of a grid's cells at random, but not the start or the cells next to it.
@@ -20,35 +19,6 @@ fn airspace(key: u64, shape: Shape, start: Cell, radius: usize) -> Airspace {
         !near && closed(shape.index(Cell { row, col }))
     });
     Airspace::new(shape, Some(Arc::new(map)), radius)
-}
-
-/// Computes the score of the robots' paths from the set of their cells. Each cell counts once.
-fn score(objective: Objective, field: &Field, air: &Airspace, paths: &[&[Move]]) -> f32 {
-    let shape = air.shape();
-    let value = |at: (usize, usize)| match objective.target {
-        Target::State(state) => field.belief.probability(state)[at],
-        Target::Entropy => field.belief.mean_entropy()[at],
-        Target::Coverage => 0.0,
-    };
-    let radius = match objective.target {
-        Target::Entropy => air.radius(),
-        _ => 0,
-    };
-    let mut counted = BTreeSet::new();
-    for path in paths {
-        let mut cell = field.starts[0];
-        for step in *path {
-            let next = step.apply(cell, shape);
-            cell = if air.is_free(next) { next } else { cell };
-            for (row, col) in ndarray::indices(shape.dim()) {
-                if row.abs_diff(cell.row).max(col.abs_diff(cell.col)) <= radius {
-                    counted.insert((row, col));
-                }
-            }
-        }
-    }
-    let bonus = objective.coverage_bonus * counted.len() as f32;
-    counted.into_iter().map(value).sum::<f32>() + bonus
 }
 
 /// Checks that no move of a path leads into a no-fly cell.
@@ -73,13 +43,13 @@ proptest! {
         let shape = Shape::new(height, width).expect("test shape");
         let start = shape.cell((key % shape.n_cells() as u64) as usize);
         let air = airspace(key, shape, start, radius);
-        let field = Field::new(shape, vec![start], 5, key);
+        let field = Field::new(shape, vec![start; 2], 5, key);
         let objective = Objective { coverage_bonus: 0.1, ..Objective::new(target) };
         let values = objective.values_in(&field.belief, &air);
         let mut best = f32::NEG_INFINITY;
         for code in 0..4_u64.pow(5) {
             let path = [0, 2, 4, 6, 8].map(|bits| Move::from_low_bits(code >> bits));
-            let expected = score(objective, &field, &air, &[&path]);
+            let expected = field.score(objective, &air, &[&path]);
             let got = values.score(start, &path);
             prop_assert!((got - expected).abs() < 1e-4, "{got}, expected {expected}");
             best = best.max(expected);
@@ -94,17 +64,16 @@ proptest! {
         ];
         for (mut planner, is_exact) in planners {
             let plan = planner.plan(&problem);
-            let flown = score(objective, &field, &air, &[&plan.moves]);
+            let flown = field.score(objective, &air, &[&plan.moves]);
             prop_assert!((plan.score - flown).abs() < 1e-4, "{} {flown}", plan.score);
             let is_best = (plan.score - best).abs() < 1e-4;
             prop_assert!(!is_exact || is_best, "{} {best}", plan.score);
             prop_assert!(avoids(&air, start, &plan.moves));
         }
         // A robot gains nothing from cells that a teammate sees or visits.
-        let (team, random) = ([start; 2], (problem.seed, problem.step));
-        let team = plan_team(&mut BeamSearch::new(20), &values, &team, 5, random, 0);
+        let team = plan_team(&mut BeamSearch::new(20), &values, &field.starts, 5, RANDOM, 0);
         let paths = [0, 1].map(|robot| &*team[robot].moves);
-        let (gains, together) = (team[0].score + team[1].score, score(objective, &field, &air, &paths));
+        let (gains, together) = (team[0].score + team[1].score, field.score(objective, &air, &paths));
         prop_assert!((gains - together).abs() < 1e-3, "{gains} {together}");
         let layers = ValueLayers::new(&field.belief, &air, 0, &Memory::new(shape), 5);
         let proposals = OptionPlanner::new(20).propose(&layers, start);

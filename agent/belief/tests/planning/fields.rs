@@ -3,8 +3,9 @@
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::{CellValues, Objective, PlanningProblem, Target};
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Probabilities, Shape};
+use emberwatch_model::{Airspace, Cell, Move, Probabilities, Shape};
 use proptest::prelude::*;
+use std::collections::BTreeSet;
 
 /// The seed and the step that select the planners' random numbers.
 pub const RANDOM: (u64, u64) = (3, 5);
@@ -34,6 +35,34 @@ impl Field {
 
     pub fn values(&self) -> CellValues {
         Objective::new(Target::State(0)).values(&self.belief)
+    }
+
+    /// Computes the score of the robots' paths from the set of their cells. Each cell counts once.
+    pub fn score(&self, objective: Objective, air: &Airspace, paths: &[&[Move]]) -> f32 {
+        let radius = match objective.target {
+            Target::Entropy => air.radius(),
+            _ => 0,
+        };
+        let mut counted = BTreeSet::new();
+        for (start, path) in self.starts.iter().zip(paths) {
+            let mut cell = *start;
+            for step in *path {
+                let next = step.apply(cell, air.shape());
+                cell = if air.is_free(next) { next } else { cell };
+                for (row, col) in ndarray::indices(air.shape().dim()) {
+                    if row.abs_diff(cell.row).max(col.abs_diff(cell.col)) <= radius {
+                        counted.insert((row, col));
+                    }
+                }
+            }
+        }
+        let value = |at: &(usize, usize)| match objective.target {
+            Target::State(state) => self.belief.probability(state)[*at],
+            Target::Entropy => self.belief.mean_entropy()[*at],
+            Target::Coverage => 0.0,
+        };
+        let bonus = objective.coverage_bonus * counted.len() as f32;
+        counted.iter().map(value).sum::<f32>() + bonus
     }
 
     /// Returns the planning problem of the first robot.

@@ -79,33 +79,6 @@ proptest! {
 }
 
 #[test]
-fn a_wider_beam_is_better_on_average_and_shooting_worse() {
-    let shape = Shape::new(64, 64).expect("valid sides");
-    let scores = |planner: &mut dyn Planner| -> Vec<f32> {
-        let score = |seed: u64| {
-            let field = Field::new(shape, vec![shape.cell(seed as usize * 67)], 64, seed);
-            planner.plan(&field.problem(&field.values())).score
-        };
-        (0..25).map(score).collect()
-    };
-    let [shooting, narrow, middle, wide] = [
-        scores(&mut Shooting::new(256, Integration::ClampEachMove)),
-        scores(&mut BeamSearch::new(2)),
-        scores(&mut BeamSearch::new(8)),
-        scores(&mut BeamSearch::new(80)),
-    ];
-    for (better, worse) in [(&middle, &narrow), (&wide, &middle), (&narrow, &shooting)] {
-        // The mean of the differences, in standard errors.
-        let differences: Vec<f32> = better.iter().zip(worse).map(|(a, b)| a - b).collect();
-        let n = differences.len() as f32;
-        let mean = differences.iter().sum::<f32>() / n;
-        let squares: f32 = differences.iter().map(|d| (d - mean).powi(2)).sum();
-        let t = mean / (squares / (n - 1.0) / n).sqrt();
-        assert!(t > 3.0, "{t}");
-    }
-}
-
-#[test]
 fn each_step_has_its_own_random_numbers() {
     let shape = Shape::new(9, 9).expect("valid sides");
     let field = Field::new(shape, vec![shape.centre()], 30, 1);

@@ -5,21 +5,24 @@ use emberwatch_belief::planning::team::{ROUNDS, plan_team, robot_seed};
 use emberwatch_belief::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, Shooting, Target,
 };
-use emberwatch_model::path::fly;
-use emberwatch_model::{Cell, Move, Shape};
+use emberwatch_model::{Airspace, Cell, Move, Shape};
 use proptest::prelude::*;
 use std::collections::BTreeSet;
 
-/// The robots of a team, and the values of cells to the team.
+/// The robots of a team on a grid without no-fly cells.
 struct Team<'a> {
     field: &'a Field,
+    objective: Objective,
     values: CellValues,
 }
 
 impl<'a> Team<'a> {
     fn new(field: &'a Field, objective: Objective) -> Self {
-        let values = objective.values(&field.belief);
-        Self { field, values }
+        Self {
+            field,
+            objective,
+            values: objective.values(&field.belief),
+        }
     }
 
     fn plan(&self, planner: &mut dyn Planner, rounds: usize) -> Vec<Plan> {
@@ -27,27 +30,19 @@ impl<'a> Team<'a> {
         plan_team(planner, &self.values, starts, n_moves, RANDOM, rounds)
     }
 
-    /// Returns the team's gain. Each cell counts once, however many robots visit it.
-    fn worth(&self, plans: &[Plan]) -> f64 {
+    fn worth(&self, plans: &[Plan]) -> f32 {
         let paths: Vec<&[Move]> = plans.iter().map(|plan| &*plan.moves).collect();
         self.worth_of(&paths)
     }
 
-    fn worth_of(&self, paths: &[&[Move]]) -> f64 {
-        let robots = self.field.starts.iter().zip(paths);
-        let shape = self.values.shape();
-        let visited = robots.flat_map(|(&start, path)| fly(shape, start, path).visited);
-        let cells: BTreeSet<usize> = visited.collect();
-        let gain = |&index: &usize| {
-            let cell = shape.cell(index);
-            self.values.value()[[cell.row, cell.col]] + self.values.coverage_bonus()
-        };
-        cells.iter().map(gain).map(f64::from).sum()
+    fn worth_of(&self, paths: &[&[Move]]) -> f32 {
+        let open = Airspace::open(self.values.shape());
+        self.field.score(self.objective, &open, paths)
     }
 }
 
 /// Tolerance for `f32` sums in a different order.
-const ROUNDING: f64 = 1e-4;
+const ROUNDING: f32 = 1e-4;
 
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(64) })]
@@ -93,7 +88,7 @@ fn two_robots_gain_nearly_what_the_best_pair_of_paths_gains() {
             let plan = |rounds| team.worth(&team.plan(&mut BeamSearch::new(16), rounds));
             let pairs = paths.iter().flat_map(|a| paths.iter().map(move |b| (a, b)));
             let optimum = pairs.map(|(a, b)| team.worth_of(&[a, b]));
-            let (worth, optimum) = (plan(ROUNDS), optimum.fold(0.0, f64::max));
+            let (worth, optimum) = (plan(ROUNDS), optimum.fold(0.0, f32::max));
             assert!(worth <= optimum + ROUNDING, "{worth} above {optimum}");
             // A greedy team reaches at least half of the optimum (Fisher, Nemhauser and Wolsey, 1978).
             assert!(worth >= optimum / 2.0 - ROUNDING, "{worth} of {optimum}");

@@ -2,10 +2,8 @@
 
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 
-/// Decay rates of the two moments.
 const BETAS: [f64; 2] = [0.9, 0.99];
 
-/// A constant added to the square root of the second moment, as in the Adam paper.
 const EPSILON: f64 = 1e-8;
 
 #[derive(Debug, Clone, PartialEq)]

@@ -46,13 +46,11 @@ pub struct Update {
     pub rate: f64,
 }
 
-/// A stream: its position in the replay buffer, and its belief before the next frame.
 #[derive(Debug, Clone, PartialEq)]
 struct Stream {
     block: Option<u64>,
     n_done: usize,
     belief: Vec<f32>,
-    /// Buffer for the belief after the next window.
     end: Vec<f32>,
 }
 
@@ -136,7 +134,6 @@ impl Optimiser {
         self.step(loss, &gradient).map(Some)
     }
 
-    /// Assigns a new block to each stream whose block is finished or was dropped.
     fn place_streams(&mut self, replay: &BlockReplay) {
         for index in 0..self.streams.len() {
             let stream = &self.streams[index];
@@ -152,13 +149,10 @@ impl Optimiser {
         }
     }
 
-    /// Returns the number of windows of a block. The last window may be shorter.
     fn n_windows(&self, block: &Block) -> usize {
         block.frames.len().div_ceil(self.config.window)
     }
 
-    /// Returns the next block of the current pass through all blocks. If the pass is complete, starts another in a new
-    /// random order.
     fn next_block<'a>(&mut self, replay: &'a BlockReplay) -> (u64, &'a Block) {
         loop {
             match self.lap.pop() {
@@ -241,7 +235,6 @@ impl Optimiser {
         Ok(Update { number, loss, rate })
     }
 
-    /// Creates an error about the update in progress.
     fn wrong(&self, tensor: &str, what: &str) -> anyhow::Error {
         let update = self.adam.n_steps + 1;
         anyhow!("update {update}: {tensor}: expected finite numbers, got {what}")

@@ -116,7 +116,6 @@ impl Worlds {
         self.airspace.shape()
     }
 
-    /// Creates an agent at its first observation. `target` is the index of the state with the highest reward.
     pub(super) fn new_agent(
         &self,
         config: &AgentConfig,
@@ -164,7 +163,6 @@ pub trait Learner: Actor {
     fn contents(&self) -> Result<Contents>;
 }
 
-/// Puts a robot's run in its place, and returns the run of its last episode.
 pub(super) fn replace<R>(runs: &mut Vec<R>, worlds: &Worlds, robot: u32, run: R) -> Option<R> {
     let index = (robot - worlds.numbers.start) as usize;
     match runs.get_mut(index) {

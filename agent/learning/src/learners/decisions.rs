@@ -70,7 +70,6 @@ pub struct DecisionsLearner {
     pub(super) dqn: Dqn,
     runs: Vec<Run>,
     world_steps: u64,
-    /// Number of updates that are due but not made yet.
     earned: f64,
 }
 
@@ -98,7 +97,6 @@ impl DecisionsLearner {
         Ok(learner)
     }
 
-    /// Creates an agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let (base, names) = (&self.base, self.base.state_names.clone());
         let (config, policy) = (&self.config, (&self.policy, self.base.target));
@@ -106,8 +104,6 @@ impl DecisionsLearner {
         worlds.new_agent(config, policy, estimator, names, observation)
     }
 
-    /// Chooses the option that a robot flies: the option with the highest value, or a random option that it keeps for
-    /// some steps.
     fn choose(&self, index: usize, features: &[f32], held: &mut Held) -> usize {
         let step = self.world_steps + index as u64;
         let mut rng = stream(self.config.seed, Purpose::Exploration, step);
@@ -126,7 +122,6 @@ impl DecisionsLearner {
         held.option
     }
 
-    /// Plans all options of all robots, stores the transitions of the last options, and chooses the next options.
     fn decide(&mut self) {
         let proposals = in_parallel(self.runs.iter_mut(), Run::propose);
         let mut runs = std::mem::take(&mut self.runs);
@@ -141,15 +136,12 @@ impl DecisionsLearner {
         self.runs = runs;
     }
 
-    /// Returns the current factor that the step size is multiplied by. It falls linearly over the configured number of
-    /// steps.
     fn rate_share(&self) -> f32 {
         let config = &self.config.decisions;
         let done = self.world_steps as f32 / config.steps.max(1) as f32;
         (1.0 - done).max(config.final_rate)
     }
 
-    /// Loads a checkpoint of decisions on the same kind of belief.
     fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedDecisions = contents.state()?;
         saved.load_into(&mut self.dqn, contents)?;

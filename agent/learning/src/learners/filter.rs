@@ -32,7 +32,6 @@ pub struct FilterLearner {
     fit: FilterFit,
     learned: LearnedModel,
     agents: Vec<ActingAgent>,
-    /// The last plan of each robot, with the belief that it was based on.
     planned: Vec<(Belief, Plan)>,
 }
 
@@ -102,7 +101,6 @@ impl FilterLearner {
         })
     }
 
-    /// Creates a robot's agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape()));
@@ -118,7 +116,6 @@ impl FilterLearner {
         )
     }
 
-    /// Returns the number of worlds whose robots move at random: first all, later a share.
     fn n_walking(&self) -> usize {
         let learning = &self.config.learning;
         if self.fit.world_steps < learning.explore_steps {

@@ -58,7 +58,6 @@ fn build(on: LearnerInputs<'_>) -> Result<Box<dyn Learner>> {
     )))
 }
 
-/// Checks that the server permits full frames, if the settings require them for the first iterations.
 fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInfo) -> Result<()> {
     let full_frames = config.autoencoder.full_frames;
     ensure!(
@@ -69,8 +68,7 @@ fn check_full_frames(progress: &Progress, config: &AgentConfig, info: &ServerInf
     Ok(())
 }
 
-/// Checks that an episode has at least as many frames as a training window. With shorter episodes, nothing could be
-/// learned.
+/// With shorter episodes, nothing could be learned.
 fn check_window(config: &AgentConfig, info: &ServerInfo) -> Result<()> {
     // For recorded worlds, the server reports only the length of the shortest episode, so other episodes can be long
     // enough.
@@ -92,18 +90,14 @@ pub struct NetworkLearner {
     worlds: Worlds,
     config: AgentConfig,
     pub(super) progress: Progress,
-    /// The frames for training.
     replay: FrameReplay,
     /// The latest steps, whose transitions are not yet in the DQN's replay buffer.
     track: Track,
     choices: Vec<Policy>,
-    /// The agent, once attached to a world.
     acting: Option<ActingAgent>,
-    /// The last decision, with its path.
     decision: Option<Decision>,
 }
 
-/// An action, the hidden vector from which it was chosen, its value, and its path.
 struct Decision {
     input: Vec<f32>,
     action: usize,
@@ -153,7 +147,6 @@ impl NetworkLearner {
         }
     }
 
-    /// Stores the transition of the last decision. At the end of an episode, also stores the unfinished transitions.
     fn remember(&mut self) {
         let decision = self.decision.as_ref();
         let decision = decision.expect("invariant: a step begins with a decision");

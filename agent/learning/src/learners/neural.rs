@@ -58,17 +58,14 @@ pub struct NeuralLearner {
     worlds: Worlds,
     config: AgentConfig,
     network: NeuralBelief,
-    /// The filter whose prediction the network corrects, if any.
     filter: Option<Box<LearnedModel>>,
     reward: RewardEstimate,
     replay: LessonReplay,
     runs: Vec<Run>,
     world_steps: u64,
-    /// Number of updates that are due but not made yet.
     earned: f64,
 }
 
-/// A robot in its world.
 struct Run {
     acting: ActingAgent,
     behaviour: Option<Behaviour>,
@@ -110,7 +107,6 @@ impl NeuralLearner {
         self.reward.target().unwrap_or(last)
     }
 
-    /// Creates a robot's agent at its first observation.
     fn agent_at(&self, observation: Observation) -> Result<ActingAgent> {
         let filter = self.filter.as_deref();
         let estimator = estimator(&self.network, filter, self.worlds.shape())?;
@@ -121,12 +117,10 @@ impl NeuralLearner {
         worlds.new_agent(&self.config, policy, estimator, names, observation)
     }
 
-    /// Returns the completed fraction of the training steps.
     fn progress(&self) -> f64 {
         self.world_steps as f64 / self.config.neural.steps.max(1) as f64
     }
 
-    /// Returns the step size, which falls linearly over the configured number of steps.
     fn rate(&self) -> f64 {
         let config = &self.config.neural;
         config.rate * (1.0 - self.progress()).max(config.final_rate)

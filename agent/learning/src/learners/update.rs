@@ -14,8 +14,7 @@ pub struct ModelUpdate {
 }
 
 impl ModelUpdate {
-    /// Creates the report of a step without an update, after `number` updates. `n_more` is the length of
-    /// [`super::LearnerKind::columns`].
+    /// Creates the report of a step without an update, with `n_more` empty columns.
     pub fn nothing(number: u64, n_more: usize) -> Self {
         Self {
             number,

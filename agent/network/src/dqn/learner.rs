@@ -129,17 +129,14 @@ pub struct Dqn {
     pub(super) shape: DqnShape,
     network: Perceptron,
     pub(super) adam: Adam,
-    /// The target network, which follows the network slowly.
     target: Perceptron,
     pub(super) target_variables: Variables,
     /// The replay buffer, the oldest transition first.
     pub(super) memory: VecDeque<Transition>,
 }
 
-/// Linear layers with ReLU between them.
 struct Perceptron(Vec<Linear>);
 
-/// A batch of transitions, as tensors.
 struct Batch {
     input: Tensor,
     action: Tensor,
@@ -214,10 +211,7 @@ impl Dqn {
         self.settings.adam.learning_rate = learning_rate;
     }
 
-    /// Computes the value of each choice of a decision, `Q(h, .)`.
-    ///
-    /// # Panics
-    /// If `input` has the wrong length.
+    /// Computes the value of each choice of a decision, `Q(h, .)`. Panics if `input` has the wrong length.
     pub fn values(&self, input: &[f32]) -> Vec<f32> {
         assert_eq!(
             input.len(),
@@ -245,8 +239,7 @@ impl Dqn {
         (0..values.len()).fold(0, larger)
     }
 
-    /// Returns a random choice with the probability that [`DqnSettings::epsilon_at`] returns, and otherwise the best
-    /// choice.
+    /// Returns a random choice with the probability [`DqnSettings::epsilon_at`], and otherwise the best choice.
     pub fn act(&self, input: &[f32], step: u64) -> usize {
         let mut rng = stream(self.seed, Purpose::Exploration, step);
         if uniform(&mut rng) < self.settings.epsilon_at(step) {
@@ -256,8 +249,7 @@ impl Dqn {
         }
     }
 
-    /// Returns an empty track, which combines the steps of an episode into transitions of [`DqnSettings::n_step`]
-    /// steps.
+    /// Returns an empty track, which combines steps into transitions of [`DqnSettings::n_step`] steps.
     pub fn track(&self) -> Track {
         Track::new(self.settings.n_step)
     }
@@ -346,8 +338,7 @@ impl Dqn {
         }
     }
 
-    /// Returns whether a transition fits the DQN. The input must contain the features of one candidate, and the next
-    /// input the features of all candidates.
+    /// The input must contain the features of one candidate, and the next input the features of all candidates.
     fn fits(&self, transition: &Transition) -> bool {
         transition.input.len() == self.shape.n_inputs
             && transition.next.len() == self.shape.n_numbers()
@@ -377,7 +368,6 @@ impl Batch {
     }
 }
 
-/// Computes the mean Huber loss: half the squared difference, which continues linearly for differences above 1.
 fn huber(got: &Tensor, goal: &Tensor) -> CandleResult<Tensor> {
     let size = (got - goal)?.abs()?;
     let near = size.minimum(1.0)?;

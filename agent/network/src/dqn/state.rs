@@ -6,13 +6,11 @@ use crate::tensors::{NamedTensor, found, named_numbers, set};
 use crate::variables::Variables;
 
 impl Dqn {
-    /// Returns the tensors of a checkpoint: the variables of the network and of its target network under PyTorch's
-    /// names, and Adam's moments.
+    /// Returns the variables of both networks under PyTorch's names, and Adam's moments, for a checkpoint.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
         on_cpu(named_numbers(&self.groups()))
     }
 
-    /// Returns the variables of the network and of its target network, and Adam's moments.
     pub(super) fn groups(&self) -> [(&'static str, &Variables); 3] {
         [
             ("dqn.network.", self.adam.variables()),

@@ -12,7 +12,6 @@ use super::cpu::{Frames, frames, sum};
 use super::norm::{Norm, Sums};
 use crate::dropout::Mask;
 
-/// The order of ReLU and normalisation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Order {
     /// First ReLU, then the normalisation, as in the encoder. The scale of dropout must be positive.
@@ -21,7 +20,6 @@ pub(crate) enum Order {
     NormFirst,
 }
 
-/// Dropout, normalisation and ReLU before a convolution.
 pub(super) struct Activation {
     pub(super) order: Order,
     /// `None` for the input of the encoder, which is not normalised.
@@ -31,7 +29,6 @@ pub(super) struct Activation {
     pub(super) floors: Vec<f32>,
 }
 
-/// The gradient of a convolution's result, frame by frame.
 pub(super) enum ResultGradient<'a> {
     Given(Frames),
     /// Computed from the next activation: `dy` is the gradient of its normalisation's output.
@@ -44,7 +41,6 @@ pub(super) enum ResultGradient<'a> {
 }
 
 impl ResultGradient<'_> {
-    /// Writes the gradient of a frame's kept planes.
     #[inline(always)]
     pub(super) fn write(&self, frame: usize, to: &mut [f32]) {
         match self {
@@ -60,7 +56,6 @@ impl ResultGradient<'_> {
 }
 
 impl Order {
-    /// Computes the step before the normalisation.
     #[inline(always)]
     fn first(self, z: f32) -> f32 {
         match self {
@@ -69,7 +64,6 @@ impl Order {
         }
     }
 
-    /// Computes the step after the normalisation.
     #[inline(always)]
     pub(super) fn second(self, y: f32) -> f32 {
         match self {
@@ -78,7 +72,6 @@ impl Order {
         }
     }
 
-    /// Adds a plane to the sums for the moments of the next normalisation.
     #[inline(always)]
     pub(super) fn add_moments(self, sums: &mut Sums, channel: usize, z: &[f32]) {
         sums.add(
@@ -145,7 +138,6 @@ impl Activation {
         }
     }
 
-    /// Computes the gradient `dz` of the convolution's result from `dy`, for one frame.
     #[inline(always)]
     fn normalise_gradient(
         &self,
@@ -188,7 +180,6 @@ impl Activation {
     }
 }
 
-/// Copies the kept planes of dense maps `[frames, channels, cells]`, and computes their sums for a normalisation.
 pub(super) fn kept_planes(maps: &[f32], mask: &Mask, order: Order) -> (Frames, Sums) {
     let area = maps.len() / (mask.n_frames() * mask.channels());
     let (planes, sums) = frames(

@@ -13,7 +13,6 @@ pub(crate) const LOG_FLOOR: f64 = 1e-10;
 /// The mean loss over a window's targets, in nats per cell, and its gradients.
 pub(crate) struct WindowLoss {
     pub(crate) loss: f64,
-    /// Gradient of the logits.
     pub(crate) d_logits: Frames,
     /// Gradient of `O [observations, states]`.
     pub(crate) d_observation: Vec<f32>,
@@ -60,11 +59,9 @@ pub(crate) fn window_loss(
     }
 }
 
-/// Sums over cells, and buffers for one cell.
 struct CellLoss<'a> {
     /// `O [observations, states]`, whose columns sum to one.
     observation: &'a [f32],
-    /// The weight of each cell in the loss.
     weight: f32,
     loss: f64,
     d_observation: Vec<f64>,
@@ -86,8 +83,6 @@ impl<'a> CellLoss<'a> {
         }
     }
 
-    /// Adds the loss of a cell where `value` was observed, and replaces the cell's logits with their gradients.
-    ///
     /// The loss is minus the logarithm of a product. The product underflows only if `q_y` does: all `q` sum to one, so
     /// at most one other factor `1 - q_a` is small, and this factor is zero or at least 6e-8.
     #[inline(always)]
@@ -129,8 +124,7 @@ impl<'a> CellLoss<'a> {
     }
 }
 
-/// Returns the probability of a channel's binary outcome: `q` if the channel was observed, otherwise `1 - q`. Rounding
-/// can make `q` larger than 1, so `1 - q` is limited to at least 0.
+/// Rounding can make `q` larger than 1, so `1 - q` is limited to at least 0.
 #[inline(always)]
 fn term(q: f32, hit: bool) -> f32 {
     LOG_FLOOR as f32 + if hit { q } else { (1.0 - q).max(0.0) }

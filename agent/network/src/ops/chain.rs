@@ -8,17 +8,12 @@ use super::stage::{Layer, Stage};
 use crate::dropout::Mask;
 use candle_core::{Result, Tensor};
 
-/// A chain of layers after its forward pass over all frames.
 pub(crate) struct Chain {
     stages: Vec<Stage>,
-    /// The input of each stage, before its activation.
     z: Vec<Frames>,
 }
 
 impl Chain {
-    /// Runs the layers on maps `[frames, channels, rows, cols]` and their dropout mask. Returns the output of the last
-    /// layer.
-    ///
     /// `moments(layer, moments of the window)` returns the moments that the layer's normalisation uses.
     pub(crate) fn forward(
         (maps, mask): (&Tensor, &Mask),

@@ -15,47 +15,35 @@
 use super::cpu::add;
 use super::product::{add_product, left_factor, product, right_factor, steps};
 
-/// The sizes of a convolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Sizes {
     /// Channels, rows and columns of the large map.
     pub(crate) large: [usize; 3],
     /// Channels, rows and columns of the small map.
     pub(crate) small: [usize; 3],
-    /// Rows and columns of the kernel.
     pub(crate) kernel: [usize; 2],
     pub(crate) stride: usize,
-    /// Number of rows or columns of zeros on each side of the large map.
     pub(crate) padding: usize,
-    /// Distance between neighbouring cells that a kernel reads.
     pub(crate) dilation: usize,
 }
 
-/// A convolution with its index tables.
 #[derive(Debug, Clone)]
 pub(crate) struct Conv {
     pub(crate) sizes: Sizes,
     taps: Vec<Tap>,
-    /// Rows and columns of each part of a padded large plane.
     part: [usize; 2],
     /// Number of rows of zeros above a small plane, and of columns of zeros left of it.
     margin: [usize; 2],
-    /// Number of columns of a small plane with its margins.
     framed_cols: usize,
-    /// Number of cells of a small plane with its margins.
     framed: usize,
 }
 
-/// One position of the kernel.
 #[derive(Debug, Clone, Copy)]
 struct Tap {
-    /// Index of the part that the tap reads.
     part: usize,
-    /// Offset of the tap's run in that part, in rows and columns.
     shift: [usize; 2],
 }
 
-/// Buffers for the maps of one frame.
 pub(crate) struct Buffers {
     large: Vec<f32>,
     small: Vec<f32>,
@@ -66,10 +54,7 @@ pub(crate) struct Buffers {
 }
 
 impl Conv {
-    /// Creates a convolution and its index tables.
-    ///
-    /// # Panics
-    /// If the sizes of the two maps do not match the kernel, stride, padding and dilation.
+    /// Panics if the sizes of the two maps do not match the kernel, stride, padding and dilation.
     pub(crate) fn new(sizes: Sizes) -> Self {
         for axis in [0, 1] {
             let reach = sizes.dilation * (sizes.kernel[axis] - 1) + 1;
@@ -105,27 +90,22 @@ impl Conv {
         }
     }
 
-    /// Returns the number of weights.
     pub(crate) fn n_weights(&self) -> usize {
         self.sizes.small[0] * self.sizes.large[0] * self.taps.len()
     }
 
-    /// Returns the number of cells of the large map.
     pub(crate) fn large_area(&self) -> usize {
         self.sizes.large[1] * self.sizes.large[2]
     }
 
-    /// Returns the number of cells of the small map.
     pub(crate) fn small_area(&self) -> usize {
         self.sizes.small[1] * self.sizes.small[2]
     }
 
-    /// Returns the number of cells of a large plane that is split into parts, with padding.
     fn split(&self) -> usize {
         self.sizes.stride * self.sizes.stride * self.part[0] * self.part[1]
     }
 
-    /// Allocates buffers for one frame.
     pub(crate) fn buffers(&self) -> Buffers {
         let Sizes { large, small, .. } = self.sizes;
         let wide = (small[0] * small[1] * self.part[1]).max(large[0] * self.framed);
@@ -159,7 +139,6 @@ impl Conv {
         }
     }
 
-    /// Copies all planes of a large map.
     #[inline(always)]
     pub(crate) fn put_all_large(&self, buffers: &mut Buffers, map: &[f32]) {
         for (index, plane) in map.chunks_exact(self.large_area()).enumerate() {
@@ -167,12 +146,10 @@ impl Conv {
         }
     }
 
-    /// Returns all channels of the large map and of the small map.
     pub(crate) fn channels(&self) -> [Vec<usize>; 2] {
         [self.sizes.large[0], self.sizes.small[0]].map(|n| (0..n).collect())
     }
 
-    /// Copies a small plane to position `index` of the buffer. The zeros around the plane stay in place.
     #[inline(always)]
     pub(crate) fn put_small(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         let cols = self.sizes.small[2];
@@ -183,8 +160,7 @@ impl Conv {
         }
     }
 
-    /// Copies a small plane, transposed to channels last, for [`Self::add_weight_gradient`]. Other channels keep the
-    /// values of earlier frames until [`Self::clear_transposed`] is called.
+    /// Other channels keep the values of earlier frames until [`Self::clear_transposed`] is called.
     #[inline(always)]
     pub(crate) fn transpose_small(&self, buffers: &mut Buffers, channel: usize, plane: &[f32]) {
         let to = buffers.channels_last[channel..]
@@ -193,7 +169,6 @@ impl Conv {
         to.zip(plane).for_each(|(to, from)| *to = *from);
     }
 
-    /// Copies all planes of a small map as [`Self::transpose_small`] does.
     #[inline(always)]
     pub(crate) fn transpose_all_small(&self, buffers: &mut Buffers, map: &[f32]) {
         /// Number of cells per block. A block fits into the first-level cache.
@@ -208,13 +183,11 @@ impl Conv {
         }
     }
 
-    /// Sets the transposed small map to 0.
     #[inline(always)]
     pub(crate) fn clear_transposed(&self, buffers: &mut Buffers) {
         buffers.channels_last.fill(0.0);
     }
 
-    /// Returns the transposed small map, `[cells, channels]`.
     pub(crate) fn channels_last<'a>(&self, buffers: &'a Buffers) -> &'a [f32] {
         &buffers.channels_last
     }
@@ -331,8 +304,7 @@ impl Conv {
         }
     }
 
-    /// Finds the rows (or columns) with the given remainder that lie inside the large plane. Returns the first of them
-    /// and their number.
+    /// Returns the first row (or column) with the given remainder that lies inside the large plane, and their number.
     fn inside(&self, remainder: usize, side: usize) -> (usize, usize) {
         let Sizes {
             stride, padding, ..
@@ -342,8 +314,6 @@ impl Conv {
         (first, end.saturating_sub(first))
     }
 
-    /// Adds the gradient of the weights to `to`. The gradient is computed from the given large channels and the
-    /// transposed small map in `buffers`.
     #[inline(always)]
     pub(crate) fn add_weight_gradient(&self, buffers: &Buffers, large: &[usize], to: &mut [f32]) {
         let ([n, rows, cols], width) = (self.sizes.small, self.part[1]);
@@ -366,14 +336,12 @@ impl Conv {
         );
     }
 
-    /// Returns the start of a tap's run in a split plane.
     fn run(&self, tap: usize) -> usize {
         let Tap { part, shift } = self.taps[tap];
         (part * self.part[0] + shift[0]) * self.part[1] + shift[1]
     }
 }
 
-/// Copies every `n`th element of `from` to consecutive elements of `to`.
 #[inline(always)]
 fn every(n: usize, from: &[f32], to: &mut [f32]) {
     #[inline(always)]
@@ -390,7 +358,6 @@ fn every(n: usize, from: &[f32], to: &mut [f32]) {
     }
 }
 
-/// Adds consecutive numbers to every `n`th element of `to`.
 #[inline(always)]
 fn add_to_every(n: usize, numbers: &[f32], to: &mut [f32]) {
     match n {

@@ -20,7 +20,6 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_
     Ok(Numbers { storage, range })
 }
 
-/// Returns values as [`numbers`] does, but from an argument of a candle operator.
 pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     match (storage, layout.contiguous_offsets()) {
         (CpuStorage::F32(numbers), Some((start, end))) => Ok(&numbers[start..end]),
@@ -44,8 +43,7 @@ impl<G: Deref<Target = Storage>> Deref for Numbers<G> {
     }
 }
 
-/// Creates a tensor from numbers that were computed from the tensors `from`. `backward` converts the gradient of the
-/// result into the concatenated gradients of these tensors, in the same order.
+/// `backward` converts the gradient of the result into the concatenated gradients of `from`, in the same order.
 pub(crate) fn derived(
     from: &[&Tensor],
     shape: impl Into<Shape>,
@@ -89,10 +87,8 @@ impl<F: Fn(&[f32]) -> Vec<f32> + Send + Sync> CustomOp1 for Derived<F> {
     }
 }
 
-/// The values of all frames, in chunks of consecutive frames.
 pub(crate) struct Frames {
     chunks: Vec<Chunk>,
-    /// Number of frames per chunk.
     length: usize,
 }
 
@@ -136,7 +132,6 @@ pub(super) fn frames<A: Send>(
 }
 
 impl Frames {
-    /// Splits numbers into frames of equal length.
     pub(crate) fn of(n_frames: usize, numbers: &[f32]) -> Self {
         let n = numbers.len() / n_frames;
         let copy = |_: &mut (), frame: usize, to: &mut [f32]| {
@@ -145,7 +140,6 @@ impl Frames {
         frames(n_frames, |_| n, || (), copy).0
     }
 
-    /// Returns the values of a frame.
     #[inline(always)]
     pub(super) fn frame(&self, frame: usize) -> &[f32] {
         let (chunk, at) = (&self.chunks[frame / self.length], frame % self.length);
@@ -153,7 +147,6 @@ impl Frames {
         &chunk.numbers[start..chunk.ends[at]]
     }
 
-    /// Returns the values of all frames.
     pub(crate) fn concat(mut self) -> Vec<f32> {
         match self.chunks.len() {
             1 => self.chunks.remove(0).numbers,
@@ -175,7 +168,6 @@ pub(super) fn total<T: Copy + AddAssign>(sums: impl IntoIterator<Item = Vec<T>>)
     total
 }
 
-/// Computes `to += numbers`.
 #[inline(always)]
 pub(super) fn add<T: Copy + AddAssign>(to: &mut [T], numbers: &[T]) {
     for (to, number) in to.iter_mut().zip(numbers) {
@@ -183,7 +175,6 @@ pub(super) fn add<T: Copy + AddAssign>(to: &mut [T], numbers: &[T]) {
     }
 }
 
-/// Computes `to += factor numbers`.
 #[inline(always)]
 pub(super) fn add_scaled(to: &mut [f32], factor: f32, numbers: &[f32]) {
     for (to, number) in to.iter_mut().zip(numbers) {
@@ -191,7 +182,6 @@ pub(super) fn add_scaled(to: &mut [f32], factor: f32, numbers: &[f32]) {
     }
 }
 
-/// Returns the sum of numbers, computed in sixteen lanes.
 #[inline(always)]
 pub(super) fn sum(numbers: &[f32]) -> f32 {
     let (numbers, rest) = numbers.as_chunks::<16>();

@@ -6,7 +6,6 @@ use candle_core::{Result, Tensor};
 use emberwatch_model::vectors::vectorised;
 
 struct Gru {
-    /// Length of `h`.
     n: usize,
     /// `W_hh [3 n, n]`.
     w: Vec<f32>,

@@ -5,13 +5,11 @@ use super::cpu::total;
 /// A constant that is added to the variance, as in PyTorch.
 pub(crate) const EPSILON: f64 = 1e-5;
 
-/// Mean and variance of each channel, over all frames and positions.
 #[derive(Debug, Clone)]
 pub(crate) struct Moments {
     pub(crate) mean: Vec<f64>,
     /// The population variance, divided by the number of values.
     pub(crate) variance: Vec<f64>,
-    /// Number of values per channel.
     pub(crate) count: f64,
 }
 
@@ -52,7 +50,6 @@ impl Sums {
         }
     }
 
-    /// Adds `f(a, b)` for each pair of values of a channel's planes.
     #[inline(always)]
     pub(super) fn add(
         &mut self,
@@ -103,7 +100,6 @@ pub(super) struct Norm {
     scale: f64,
 }
 
-/// The result of a normalisation's backward pass.
 pub(super) struct NormGradient {
     pub(super) gamma: Vec<f32>,
     pub(super) beta: Vec<f32>,
@@ -112,7 +108,6 @@ pub(super) struct NormGradient {
 }
 
 impl Norm {
-    /// Creates a normalisation from `[gamma, beta]`, moments, and the factor by which dropout scales kept values.
     pub(super) fn new([gamma, beta]: [&[f32]; 2], moments: Moments, scale: f32) -> Self {
         let scale = f64::from(scale);
         let inverse = moments.variance.iter();

@@ -16,11 +16,9 @@ pub(super) struct Left<'a> {
 pub(super) struct Right<'a> {
     numbers: &'a [f32],
     terms: &'a [usize],
-    /// Length of a row.
     cols: usize,
 }
 
-/// Creates a left factor.
 pub(super) fn left_factor<'a>(
     numbers: &'a [f32],
     rows: &'a [usize],
@@ -33,7 +31,6 @@ pub(super) fn left_factor<'a>(
     }
 }
 
-/// Creates a right factor with rows of length `cols`.
 pub(super) fn right_factor<'a>(numbers: &'a [f32], terms: &'a [usize], cols: usize) -> Right<'a> {
     Right {
         numbers,
@@ -42,20 +39,15 @@ pub(super) fn right_factor<'a>(numbers: &'a [f32], terms: &'a [usize], cols: usi
     }
 }
 
-/// Returns the first `n` multiples of `step`, which are the row offsets of a contiguous matrix.
 pub(super) fn steps(n: usize, step: usize) -> Vec<usize> {
     (0..n).map(|at| at * step).collect()
 }
 
-/// Computes `out = left right`. `rows` contains the start of each row in `out`.
-///
-/// # Panics
-/// If an index is outside its slice.
+/// `rows` contains the start of each row in `out`. Panics if an index is outside its slice.
 pub(super) fn product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>) {
     compute(out, rows, left, right, false);
 }
 
-/// Computes `out += left right`, with the same arguments as [`product`].
 pub(super) fn add_product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>) {
     compute(out, rows, left, right, true);
 }
@@ -95,13 +87,11 @@ fn compute(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>, ad
     });
 }
 
-/// A product whose indices have been checked.
 struct Call<'a> {
     out: &'a mut [f32],
     rows: &'a [usize],
     left: Left<'a>,
     right: Right<'a>,
-    /// Whether the product is added to the previous values.
     adds: bool,
 }
 
@@ -128,7 +118,6 @@ impl WithSimd for Call<'_> {
 }
 
 impl Call<'_> {
-    /// Computes `VECTORS` vectors of columns, in blocks of at most `max_rows` rows and nearly equal size.
     #[inline(always)]
     fn columns<S: Simd, const VECTORS: usize, const WHOLE: bool>(
         &mut self,

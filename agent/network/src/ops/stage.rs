@@ -12,21 +12,17 @@ use super::norm::{Norm, Sums};
 use crate::dropout::Mask;
 use candle_core::{Result, Tensor};
 
-/// The arguments of one convolution and of the normalisation before it.
 pub(crate) struct Layer<'a> {
     pub(crate) conv: Conv,
-    /// Whether the convolution is transposed, from small maps to large ones.
     pub(crate) transposed: bool,
     /// `[kernel rows * kernel cols * large channels, small channels]`.
     pub(crate) weights: Tensor,
     pub(crate) bias: Option<&'a Tensor>,
     /// Gamma and beta; `None` for the encoder's first layer.
     pub(crate) norm: Option<[&'a Tensor; 2]>,
-    /// Dropout mask of the result.
     pub(crate) output: &'a Mask,
 }
 
-/// A layer with the activation before it.
 pub(super) struct Stage {
     conv: Conv,
     transposed: bool,
@@ -38,14 +34,12 @@ pub(super) struct Stage {
     start: Vec<f32>,
 }
 
-/// Gradients summed over frames, and buffers for one frame.
 pub(super) struct Gradients {
     buffers: Buffers,
     plane: Vec<f32>,
     d_out: Vec<f32>,
     dx: Vec<f32>,
     weights: Vec<f32>,
-    /// The gradient of [`Stage::start`].
     start: Vec<f32>,
     sums: Sums,
 }
@@ -78,7 +72,6 @@ impl Stage {
         Ok(stage)
     }
 
-    /// Returns the number of cells of the input and of the result.
     pub(super) fn areas(&self) -> [usize; 2] {
         let (large, small) = (self.conv.large_area(), self.conv.small_area());
         if self.transposed {
@@ -88,7 +81,6 @@ impl Stage {
         }
     }
 
-    /// Returns all channels of the input and of the result.
     fn all_channels(&self) -> [Vec<usize>; 2] {
         let [large, small] = self.conv.channels();
         if self.transposed {
@@ -98,7 +90,6 @@ impl Stage {
         }
     }
 
-    /// Copies an input plane to the buffer that [`Self::convolve`] reads.
     #[inline(always)]
     fn put(&self, buffers: &mut Buffers, index: usize, plane: &[f32]) {
         if self.transposed {
@@ -108,7 +99,6 @@ impl Stage {
         }
     }
 
-    /// Copies the floors to the buffers, as if they were one frame.
     fn put_floors(&self, buffers: &mut Buffers) {
         let mut plane = vec![0.0; self.areas()[0]];
         for (channel, floor) in self.before.floors.iter().enumerate() {
@@ -120,7 +110,6 @@ impl Stage {
         }
     }
 
-    /// Adds the convolution of the `inputs` in `buffers` to the `outputs`.
     #[inline(always)]
     fn convolve(
         &self,
@@ -137,7 +126,6 @@ impl Stage {
         }
     }
 
-    /// Computes a frame's activations, and calls `put(buffers, index, channel, plane)` with each plane.
     #[inline(always)]
     fn read(
         &self,
@@ -153,8 +141,7 @@ impl Stage {
         }
     }
 
-    /// Computes the results of all frames, and their sums for the next normalisation. `order` is the order of ReLU and
-    /// the next normalisation.
+    /// `order` is the order of ReLU and the next normalisation.
     pub(super) fn forward(&self, z: &Frames, order: Order) -> Result<(Frames, Sums)> {
         let (weights, [in_area, area]) = (numbers(&self.weights)?, self.areas());
         let weights = &weights[..];
@@ -187,8 +174,6 @@ impl Stage {
         Ok((out, Sums::total(&sums)))
     }
 
-    /// Computes the gradient `dy` of the normalisation's output for all frames, and the sums of each chunk of frames,
-    /// from the gradient of the result.
     pub(super) fn backward(
         &self,
         z: &Frames,
@@ -247,7 +232,6 @@ impl Stage {
         }
     }
 
-    /// Copies an input plane to the buffer that [`Conv::add_weight_gradient`] reads.
     #[inline(always)]
     fn put_for_gradient(&self, buffers: &mut Buffers, [index, channel]: [usize; 2], plane: &[f32]) {
         if self.transposed {
@@ -257,8 +241,6 @@ impl Stage {
         }
     }
 
-    /// Adds the gradient of the weights, computed from the inputs in `to.buffers` and the gradient `to.d_out` of the
-    /// outputs. Also writes the gradient `to.dx` of the inputs if it is needed.
     #[inline(always)]
     fn add_gradients(
         &self,
@@ -359,7 +341,6 @@ impl Layer<'_> {
         norm.chain([&self.weights]).chain(self.bias).collect()
     }
 
-    /// Returns the number of cells of the input.
     pub(super) fn in_area(&self) -> usize {
         if self.transposed {
             self.conv.small_area()
@@ -369,7 +350,6 @@ impl Layer<'_> {
     }
 }
 
-/// Transposes `[a, b, c]` to `[c, b, a]`.
 fn permuted(numbers: &[f32], [a, b, c]: [usize; 3]) -> Vec<f32> {
     // Rows of `to` are often a power of two apart and would evict each other from the cache, so copy through a tile.
     let (mut to, mut tile) = (vec![0.0; numbers.len()], vec![0.0; a * c]);

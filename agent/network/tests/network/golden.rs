@@ -12,22 +12,14 @@
 //! ```
 
 use crate::golden_file::{Golden, frame_from};
-use candle_core::Tensor;
-use emberwatch_model::frame::{Frame, UNOBSERVED};
-use emberwatch_model::grid::Shape;
+use crate::synthetic::{autoencoder, relative};
+use candle_core::{Tensor, Var};
+use emberwatch_model::frame::Frame;
 use emberwatch_network::{
-    AdamSettings, Autoencoder, AutoencoderSettings, Device, Dropout, NetworkError, NetworkShape,
-    Pass, Window,
+    AdamSettings, Autoencoder, AutoencoderSettings, Dropout, NetworkError, Pass, Window,
 };
-use ndarray::{Array, Array1, Array3, Array4, ArrayD, Axis, IxDyn};
-use std::borrow::Borrow;
+use ndarray::{Array, Array1, Array2, Array3, Array4, ArrayD, Axis, IxDyn};
 use std::collections::BTreeMap;
-
-fn names(golden: &mut Golden) -> Vec<String> {
-    let names = golden.0.names().expect("names");
-    let stems = names.iter().map(|name| name.trim_end_matches(".npy"));
-    stems.map(str::to_owned).collect()
-}
 
 /// Returns the authors' network with their weights.
 fn authors_network() -> Autoencoder {
@@ -35,14 +27,7 @@ fn authors_network() -> Autoencoder {
         adam: AdamSettings::paper(1e-4),
         ..AutoencoderSettings::paper()
     };
-    let shape = NetworkShape {
-        grid: Shape::new(64, 64).expect("shape"),
-        n_states: 3,
-        n_observations: 3,
-        encoding: settings.encoding,
-        hidden: settings.hidden,
-    };
-    let mut network = Autoencoder::new(settings, shape, 0, &Device::Cpu).expect("a network");
+    let mut network = autoencoder(settings, [64, 64], 0);
     let find = |name: &str, dims: &[usize]| {
         if name.starts_with("adam.") {
             return Ok(vec![0.0; dims.iter().product()]);
@@ -64,68 +49,38 @@ fn frames(golden: &mut Golden) -> Vec<Frame> {
         .collect()
 }
 
-/// Returns the largest absolute difference, relative to the largest absolute value.
-fn relative<'a>(
-    got: impl IntoIterator<Item = &'a f32>,
-    expected: impl IntoIterator<Item = impl Borrow<f32>>,
-) -> f32 {
-    let (mut worst, mut largest) = (0.0_f32, 1e-12_f32);
-    for (got, expected) in got.into_iter().zip(expected) {
-        let expected = expected.borrow();
-        worst = worst.max((got - expected).abs());
-        largest = largest.max(expected.abs());
-    }
-    worst / largest
-}
-
-/// Applies Bayes' rule (eq. 10) at visited cells to a predictor `[S, H, W]`, in place.
-fn correct(prediction: &mut Array3<f32>, frame: &Frame, matrix: &[f32]) {
-    for ((row, col), &value) in frame.values().indexed_iter() {
-        if value != UNOBSERVED {
-            let mut cell = prediction.slice_mut(ndarray::s![.., row, col]);
-            let likelihood = &matrix[usize::from(value) * cell.len()..];
-            let joint = cell.iter_mut().zip(likelihood);
-            joint.for_each(|(p, likelihood)| *p *= likelihood);
-            let evidence = cell.sum();
-            cell.mapv_inplace(|p| p / evidence);
-        }
-    }
+fn off<'a>(got: &[f32], expected: impl IntoIterator<Item = &'a f32>) -> f64 {
+    let got: Vec<f64> = got.iter().copied().map(f64::from).collect();
+    let expected: Vec<f64> = expected.into_iter().copied().map(f64::from).collect();
+    relative(&got, &expected)
 }
 
 #[test]
-fn masked_steps_reproduce_estimate_prediction_and_hidden_vector() {
+fn masked_steps_reproduce_prediction_and_hidden_vector() {
     let mut golden = Golden::open("a4_masked_step");
     let network = authors_network();
-    let matrix = network.observation_matrix().expect("a matrix");
     let mut hidden = golden.get::<f32, ndarray::Ix1>("h0").to_vec();
-    let first: Array3<f32> = golden.get("u0");
-    let mut prediction = first.permuted_axes([2, 0, 1]);
     let expected: Array<f32, ndarray::Ix2> = golden.get("h_next");
     let saved: Array1<i64> = golden.get("saved_steps");
-    let estimates: Array4<f32> = golden.get("state_est");
     let predictions: Array4<f32> = golden.get("u_next");
     for (step, frame) in frames(&mut golden).iter().enumerate() {
-        let mut estimate = prediction.clone();
-        correct(&mut estimate, frame, &matrix);
         let window = Window::new([frame]);
         hidden = network.advance(&window, &hidden).expect("finite");
-        prediction = network.predict(&hidden).expect("a predictor");
-        let error = relative(&hidden, expected.row(step).iter());
+        let error = off(&hidden, expected.row(step).iter());
         assert!(error < 1e-4, "h after step {step}: off by {error}");
         if let Some(index) = saved.iter().position(|&at| at == step as i64) {
-            for (got, expected) in [(&estimate, &estimates), (&prediction, &predictions)] {
-                let expected = expected.index_axis(Axis(0), index);
-                let expected = expected.permuted_axes([2, 0, 1]);
-                let error = relative(got, expected.iter());
-                assert!(error < 1e-4, "beliefs of step {step}: off by {error}");
-            }
+            let prediction = network.predict(&hidden).expect("a predictor");
+            let expected = predictions.index_axis(Axis(0), index);
+            let got = prediction.as_slice().expect("row-major");
+            let error = off(got, expected.permuted_axes([2, 0, 1]).iter());
+            assert!(error < 1e-4, "prediction of step {step}: off by {error}");
         }
     }
-}
-
-fn numbers(tensor: &Tensor) -> Vec<f32> {
-    let numbers = tensor.flatten_all().and_then(|flat| flat.to_vec1());
-    numbers.expect("numbers")
+    let weights: Array2<f32> = Golden::open("a4_net_weights").get("W_obs_param");
+    let exponentials = weights.mapv(f32::exp);
+    let expected = &exponentials / &exponentials.sum_axis(Axis(0));
+    let matrix = network.observation_matrix().expect("a matrix");
+    assert!(off(&matrix, expected.iter()) < 1e-6);
 }
 
 #[test]
@@ -139,37 +94,45 @@ fn updates_without_dropout_reproduce_loss_and_gradients() {
     let pass = Pass::training(&window, &dropout);
     let loss = network.network().loss(&pass, &hidden.to_vec());
     let gradients = loss.and_then(|loss| loss.backward()).expect("gradients");
-    let names_of = network.variables().keys().cloned();
-    let gradients = names_of
-        .filter(|name| !name.contains("running"))
-        .map(|name| {
-            let gradient = gradients.get(&network.variables()[&name]);
-            let gradient = numbers(gradient.expect("a gradient"));
-            (name, gradient)
-        });
-    let gradients: BTreeMap<String, Vec<f32>> = gradients.collect();
+    let values = |tensor: &Tensor| -> Vec<f32> {
+        let numbers = tensor.flatten_all().and_then(|flat| flat.to_vec1());
+        numbers.expect("numbers")
+    };
+    let learned = network
+        .variables()
+        .iter()
+        .filter(|(name, _)| !name.contains("running"));
+    let gradient = |(name, var): (&String, &Var)| {
+        (
+            name.clone(),
+            values(gradients.get(var).expect("a gradient")),
+        )
+    };
+    let gradients: BTreeMap<String, Vec<f32>> = learned.map(gradient).collect();
     let loss = network.update_with(&window, &dropout, &hidden.to_vec());
     let loss = loss.expect("finite");
     let expected: f64 = golden.get::<f64, ndarray::Ix0>("loss").into_scalar();
-    let off = (loss / expected - 1.0).abs();
-    assert!(off < 1e-4, "loss {loss}, expected {expected}");
-    for name in names(&mut golden) {
-        let (what, tensor) = name.split_once('.').unwrap_or((&name, ""));
+    assert!((loss / expected - 1.0).abs() < 1e-4, "{loss} {expected}");
+    for name in golden.0.names().expect("names") {
+        let name = name.trim_end_matches(".npy");
+        let (what, tensor) = name.split_once('.').unwrap_or((name, ""));
         let got = match what {
             "grad" => gradients[tensor].clone(),
-            "after_adam" | "after" => numbers(&network.variables()[tensor]),
+            "after_adam" | "after" => values(&network.variables()[tensor]),
             "gradnorm" => {
-                let expected = golden.get::<f64, ndarray::Ix0>(&name).into_scalar();
+                let expected = golden.get::<f64, ndarray::Ix0>(name).into_scalar();
                 let squares = gradients[tensor].iter().map(|&d| f64::from(d).powi(2));
                 let norm = squares.sum::<f64>().sqrt();
-                let off = (norm / expected - 1.0).abs();
-                assert!(off < 1e-4, "{name}: {norm}, expected {expected}");
+                assert!(
+                    (norm / expected - 1.0).abs() < 1e-4,
+                    "{name}: {norm} {expected}"
+                );
                 continue;
             }
             _ => continue,
         };
-        let expected: ArrayD<f32> = golden.get(&name);
-        let error = relative(&got, expected.iter());
+        let expected: ArrayD<f32> = golden.get(name);
+        let error = off(&got, expected.iter());
         assert!(error < 1e-4, "{name}: off by {error}");
     }
 }

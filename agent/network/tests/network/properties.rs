@@ -1,11 +1,9 @@
 //! Properties of every network: results on several threads, saved state, and numbers that are not finite.
 
-use crate::synthetic::{frames, rayon_pool};
+use crate::synthetic::{autoencoder, find, frames, rayon_pool};
 use candle_core::Tensor;
-use emberwatch_model::grid::Shape;
 use emberwatch_network::{
-    AdamSettings, Autoencoder, AutoencoderSettings, Device, NamedTensor, NetworkError,
-    NetworkShape, NotFinite, Window,
+    AdamSettings, Autoencoder, AutoencoderSettings, Device, NamedTensor, NotFinite, Window,
 };
 
 fn network(grid: [usize; 2], seed: u64) -> Autoencoder {
@@ -15,14 +13,7 @@ fn network(grid: [usize; 2], seed: u64) -> Autoencoder {
         adam: AdamSettings::paper(1e-3),
         ..AutoencoderSettings::paper()
     };
-    let shape = NetworkShape {
-        grid: Shape::new(grid[0], grid[1]).expect("shape"),
-        n_states: 3,
-        n_observations: 3,
-        encoding: settings.encoding,
-        hidden: settings.hidden,
-    };
-    Autoencoder::new(settings, shape, seed, &Device::Cpu).expect("a network")
+    autoencoder(settings, grid, seed)
 }
 
 fn window(network: &Autoencoder, n_frames: u64, one_in: u64) -> Window {
@@ -72,16 +63,8 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
     assert_eq!(error, NotFinite { update, tensor }.into());
     let after = network.variables()["decoder.2.running_mean"].to_vec1::<f32>();
     assert_eq!(before.expect("numbers"), after.expect("numbers"));
-    // The parameter is finite, but its gradient may not be.
     overwrite(&network, "decoder.8.weight", &[0.0]);
-    overwrite(&network, "encoder.13.bias", &[f32::MAX; 16]);
-    let before = tensors(&network);
-    if let Err(error) = network.update(&window) {
-        assert!(matches!(error, NetworkError::NotFinite(_)), "{error}");
-        assert_eq!(tensors(&network), before);
-    }
     // A step that overflows is not applied.
-    overwrite(&network, "encoder.13.bias", &[0.0; 16]);
     let before = tensors(&network);
     network.set_learning_rate(f32::INFINITY);
     let error = network.update(&window).expect_err("not finite");
@@ -106,14 +89,7 @@ fn a_saved_network_resumes_bit_for_bit() {
     let window = window(&network, 10, 10);
     network.update(&window).expect("finite");
     let saved = tensors(&network);
-    let find = |name: &str, dims: &[usize]| {
-        let found = saved
-            .iter()
-            .find(|tensor| tensor.0 == name)
-            .expect("a tensor");
-        assert_eq!(found.1, dims, "{name}");
-        Ok::<_, NetworkError>(found.2.clone())
-    };
+    let find = |name: &str, dims: &[usize]| find(&saved, name, dims);
     let mut resumed = self::network([32, 32], 2);
     resumed
         .load(find, network.counters())

@@ -4,7 +4,7 @@
 //! The gradient of a tensor passes through all later operators. A wrong operator therefore affects the gradients of its
 //! own tensors and of all earlier tensors.
 
-use crate::synthetic::{coin, dropout, frames};
+use crate::synthetic::{coin, dropout, frames, numbers, relative};
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Tensor};
 use emberwatch_model::grid::Shape;
@@ -12,34 +12,6 @@ use emberwatch_network::variables::{Variables, build};
 use emberwatch_network::{Network, NetworkShape, Operators, Pass, Window};
 
 const FIRST: [f32; 5] = [0.3, -1.2, 0.7, 0.1, 2.0];
-
-/// Returns the largest absolute difference between two tensors, relative to the largest absolute value.
-fn relative(got: &[f64], expected: &[f64]) -> f64 {
-    assert_eq!(got.len(), expected.len());
-    let pairs = got.iter().zip(expected);
-    let worst = pairs.map(|(got, expected)| (got - expected).abs());
-    let largest = expected.iter().map(|expected| expected.abs());
-    worst.fold(0.0, f64::max) / largest.fold(1e-30, f64::max)
-}
-
-struct Case {
-    grid: [usize; 2],
-    n_states: usize,
-    n_observations: usize,
-    n_frames: u64,
-    /// Each cell is seen with probability `1 / one_in`.
-    one_in: u64,
-    drops: bool,
-}
-
-const CASE: Case = Case {
-    grid: [64, 64],
-    n_states: 3,
-    n_observations: 3,
-    n_frames: 6,
-    one_in: 10,
-    drops: true,
-};
 
 struct Model {
     network: Network,
@@ -72,25 +44,23 @@ impl Model {
     }
 }
 
-fn numbers(tensor: &Tensor) -> Vec<f64> {
-    let numbers = tensor
-        .to_dtype(DType::F64)
-        .and_then(|tensor| tensor.flatten_all()?.to_vec1());
-    numbers.expect("numbers")
-}
-
-fn check(case: Case, all: &[Operators]) {
+/// Compares losses, gradients and predictions on frames that show each cell with probability `1 / one_in`.
+fn check(
+    [height, width]: [usize; 2],
+    [n_states, n_observations]: [usize; 2],
+    (n_frames, one_in, drops): (u64, u64, bool),
+    all: &[Operators],
+) {
     let shape = NetworkShape {
-        grid: Shape::new(case.grid[0], case.grid[1]).expect("shape"),
-        n_states: case.n_states,
-        n_observations: case.n_observations,
+        grid: Shape::new(height, width).expect("shape"),
+        n_states,
+        n_observations,
         encoding: 6,
         hidden: 5,
     };
-    let n_observations = case.n_observations as u64;
-    let frames = frames(shape.grid, n_observations, case.n_frames, case.one_in);
-    let scale = if case.drops { 2.0 } else { 1.0 };
-    let keeps = |layer, frame, channel| !case.drops || coin(layer, frame, channel);
+    let frames = frames(shape.grid, n_observations as u64, n_frames, one_in);
+    let scale = if drops { 2.0 } else { 1.0 };
+    let keeps = |layer, frame, channel| !drops || coin(layer, frame, channel);
     let dropout = dropout(frames.len(), scale, keeps);
     let window = Window::new(&frames);
     let pass = Pass::training(&window, &dropout);
@@ -130,47 +100,15 @@ fn predictions_agree(exact: &Model, model: &Model, window: &Window) {
 }
 
 #[test]
-fn of_a_devices_operators() {
-    let case = Case {
-        grid: [32, 48],
-        one_in: 9,
-        ..CASE
-    };
-    check(case, &[Operators::Own, Operators::Stock]);
-}
-
-#[test]
-fn on_full_frames() {
-    check(Case { one_in: 1, ..CASE }, &[Operators::Own]);
-}
-
-#[test]
-fn on_paths_without_dropout() {
-    let case = Case {
-        drops: false,
-        one_in: 100,
-        n_frames: 10,
-        ..CASE
-    };
-    check(case, &[Operators::Own]);
-}
-
-#[test]
-fn on_grids_of_any_sides_with_other_states_and_observations() {
-    for (grid, n_states, n_observations, one_in) in [
-        ([32, 32], 2, 4, 100),
-        ([48, 80], 4, 2, 2),
-        // The network pads these grids.
-        ([20, 33], 3, 3, 10),
-        ([6, 6], 3, 3, 2),
-    ] {
-        let case = Case {
-            grid,
-            n_states,
-            n_observations,
-            one_in,
-            ..CASE
-        };
-        check(case, &[Operators::Own]);
-    }
+fn operators_agree_with_stock_operators_in_64_bits() {
+    use Operators::{Own, Stock};
+    check([32, 48], [3, 3], (6, 9, true), &[Own, Stock]);
+    // Full frames, then paths without dropout.
+    check([64, 64], [3, 3], (6, 1, true), &[Own]);
+    check([64, 64], [3, 3], (10, 100, false), &[Own]);
+    // Other grids, states and observations. The network pads the last two grids.
+    check([32, 32], [2, 4], (6, 100, true), &[Own]);
+    check([48, 80], [4, 2], (6, 2, true), &[Own]);
+    check([20, 33], [3, 3], (6, 10, true), &[Own]);
+    check([6, 6], [3, 3], (6, 2, true), &[Own]);
 }

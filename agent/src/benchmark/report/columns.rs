@@ -6,10 +6,8 @@ use crate::benchmark::report::policy_run::{Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 
-/// What a column shows of each run.
 type Value<'a> = &'a dyn Fn(&PolicyRun) -> Option<f64>;
 
-/// A table with one row per group, built column by column.
 pub(super) struct Columns<'a> {
     groups: &'a [Group<'a>],
     headings: Vec<String>,
@@ -25,7 +23,6 @@ impl<'a> Columns<'a> {
         }
     }
 
-    /// Returns the columns that name each group. If any group is a team, they include team and number of robots.
     pub(super) fn of_names(groups: &'a [Group<'a>]) -> Self {
         let mut columns = Self::new(groups);
         columns.add("policy", |group| group.policy.into());
@@ -43,7 +40,6 @@ impl<'a> Columns<'a> {
         rows.for_each(|(row, group)| row.push(cell(group)));
     }
 
-    /// Adds a column of means over worlds.
     pub(super) fn add_mean(&mut self, heading: &str, decimals: usize, value: Value<'_>) {
         self.add(heading, |group| match group.estimate(value) {
             Some(estimate) => number(estimate.mean, decimals),
@@ -51,13 +47,11 @@ impl<'a> Columns<'a> {
         });
     }
 
-    /// Adds a column of means over worlds with standard errors.
     pub(super) fn add_estimate(&mut self, heading: &str, decimals: usize, value: Value<'_>) {
         self.add(heading, |it| with_error(it.estimate(value), decimals));
     }
 
-    /// Adds a column of differences from the baseline policy with the same number of robots in team `alone`. The
-    /// differences are paired by world.
+    /// Differences from the baseline with as many robots, each alone, paired by world.
     pub(super) fn add_difference(&mut self, baseline: &str, decimals: usize, value: Value<'_>) {
         let groups = self.groups;
         self.add("difference", |group| {
@@ -80,7 +74,6 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// Renders a table. All columns except names are right-aligned.
 pub(super) fn markdown(headings: &[&str], rows: Vec<Vec<String>>) -> String {
     let mut table = Table::new();
     table

@@ -16,10 +16,8 @@ use std::path::Path;
 /// Label of the reward axis for the wildfire model, whose reward is the number of distinct fire cells found.
 pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";
 
-/// Legend and colour of known-model policies that sample paths. Known-model policies that search have another colour.
 const SHOOTING: (&str, RGBColor) = ("known model, shooting", RGBColor(0x56, 0xb4, 0xe9));
 
-/// Legend and colour of rows from `--add`.
 const ADDED: (&str, RGBColor) = ("added", RGBColor(0xcc, 0x79, 0xa7));
 
 impl Estimate {
@@ -38,8 +36,7 @@ pub fn save(path: &Path, svg: &str) -> Result<()> {
     replace_file(path, svg.as_bytes())
 }
 
-/// Draws the mean reward per policy, the best at the top. `axis_label` names what the reward counts, such as
-/// [`FIRE_CELLS_PER_STEP`].
+/// Draws the mean reward per policy, the best at the top. `axis_label` names what the reward counts.
 pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
     let groups = groups(runs);
     let mean = |group: &Group<'_>| group.estimate(|run| Some(run.mean_reward));
@@ -70,7 +67,6 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
     save(path, &ladder.svg()?)
 }
 
-/// Returns the bar of a group, without values.
 pub(super) fn bar(group: &Group<'_>, groups: &[Group<'_>]) -> Bar {
     let team = format!("{} {}", group.team, group.robots);
     let team = groups.iter().any(Group::is_team).then_some(&*team);
@@ -91,7 +87,6 @@ pub(super) fn bar(group: &Group<'_>, groups: &[Group<'_>]) -> Bar {
     }
 }
 
-/// Returns the legend and colour of a group, which depend on its belief.
 fn kind(group: &Group<'_>) -> (&'static str, RGBColor) {
     if group.runs.iter().any(|run| run.is_added) {
         return ADDED;

@@ -46,7 +46,6 @@ pub struct About {
     pub training_seconds: Option<f64>,
 }
 
-/// The columns of an entry's file. It begins with the columns of [`About`].
 const COLUMNS: &str = "policy,by,code,commit,training_seconds,estimator,task,world_seed,steps,robots,team,mean_reward,\
                        brier,log_likelihood,worlds_fingerprint";
 
@@ -237,7 +236,6 @@ pub fn all_runs(entries: &[Entry]) -> Vec<PolicyRun> {
         .collect()
 }
 
-/// Lists the kinds of team in which runs were flown.
 fn teams<'a>(runs: impl Iterator<Item = &'a PolicyRun>) -> String {
     let teams: BTreeSet<&str> = runs.map(|run| &*run.team).collect();
     if teams.is_empty() {

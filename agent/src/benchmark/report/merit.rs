@@ -5,9 +5,7 @@ use crate::benchmark::report::number::NOTHING;
 use crate::benchmark::report::policy_run::{Group, PolicyRun};
 use emberwatch_belief::merit::RECENT_STEPS;
 
-/// Returns the table with its heading, or `None` if the runs lack the figures of merit, as runs from old files do.
-///
-/// Each difference is a policy's share of burning cells seen minus the share of `baseline`, paired by world.
+/// `None` if the runs lack the figures of merit, as runs from old files do.
 pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String> {
     let mut runs = groups.iter().flat_map(|group| &group.runs);
     runs.find_map(|run| run.grid_seen_share)?;
@@ -39,7 +37,6 @@ pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String
     Some(format!("{heading}\n{}", columns.table()))
 }
 
-/// Renders the number of worlds in which fire was detected.
 fn detected(group: &Group<'_>) -> String {
     let n_worlds = group.by_seed(|run| run.grid_seen_share).len();
     let detection = |run: &PolicyRun| run.steps_to_detection.map(|_| 1.0);

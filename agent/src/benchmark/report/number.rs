@@ -27,7 +27,6 @@ pub fn with_error(estimate: Option<Estimate>, decimals: usize) -> String {
     }
 }
 
-/// Like [`with_error`], but with a plus sign unless the mean is negative.
 pub(super) fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
     match with_error(estimate, decimals) {
         text if text.starts_with('-') => text,
@@ -44,7 +43,6 @@ pub fn number(value: f64, decimals: usize) -> String {
     text
 }
 
-/// Replaces the underscores of a policy's name with spaces.
 pub(super) fn readable(name: &str) -> String {
     name.replace('_', " ")
 }

@@ -14,8 +14,7 @@ pub struct PolicyRun {
     pub world_seed: u64,
     pub steps: u64,
     pub mean_reward: f64,
-    /// Mean number of distinct cells visited in a step. Entries of the leaderboard lack this and other columns with a
-    /// default.
+    /// Mean number of distinct cells visited in a step. Entries of the leaderboard lack columns with a default.
     #[serde(default)]
     pub mean_distinct_cells: f64,
     /// Share of the distinct visited cells that are in the state with the highest reward, in `0..=1`.
@@ -80,13 +79,11 @@ impl Group<'_> {
         (self.policy, self.estimator, self.robots, self.team)
     }
 
-    /// Estimates the mean over the runs that have a value.
     pub(super) fn estimate(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> Option<Estimate> {
         let values: Vec<f64> = self.runs.iter().filter_map(|run| value(run)).collect();
         Estimate::of(&values)
     }
 
-    /// Returns the values by seed. Runs without a value are left out.
     pub(super) fn by_seed(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> BTreeMap<u64, f64> {
         let pair = |run: &&PolicyRun| Some((run.world_seed, value(run)?));
         self.runs.iter().filter_map(pair).collect()
@@ -97,7 +94,6 @@ impl Group<'_> {
         (self.robots, self.team) != (1, ALONE)
     }
 
-    /// Returns the policy's name, followed by labels that distinguish the group from the policy's other groups.
     pub(super) fn name(&self, groups: &[Self]) -> String {
         match self.marks(groups).as_slice() {
             [] => self.policy.into(),
@@ -105,8 +101,6 @@ impl Group<'_> {
         }
     }
 
-    /// Returns the labels that distinguish the group from the policy's other groups: estimator and team, if they
-    /// differ.
     pub(super) fn marks(&self, groups: &[Self]) -> Vec<String> {
         let twins = || groups.iter().filter(|other| other.policy == self.policy);
         let mut marks = Vec::new();

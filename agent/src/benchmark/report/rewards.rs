@@ -6,7 +6,6 @@ use crate::benchmark::report::statistics::Estimate;
 use crate::charts::{Curve, Lines, MAX_CURVES, Panel, Scale};
 use std::collections::BTreeSet;
 
-/// Maximum number of points of a curve. More points would hardly be visible, and would enlarge the file.
 const MAX_POINTS: usize = 500;
 /// The moving average spans about 1 / `WINDOWS` of the steps.
 const WINDOWS: usize = 40;
@@ -51,7 +50,6 @@ fn note(runs: &[PolicyRun], window: usize, (shown, n_policies): (usize, usize)) 
     note
 }
 
-/// Returns the curves of the best policies, the highest mean first.
 fn curves(groups: &[Group<'_>], window: usize) -> Vec<Curve> {
     let mean = |group: &Group<'_>| {
         let rewards = || group.runs.iter().flat_map(|run| &run.rewards);
@@ -64,7 +62,6 @@ fn curves(groups: &[Group<'_>], window: usize) -> Vec<Curve> {
         .collect()
 }
 
-/// Returns a group's curve, over the steps that all its worlds have.
 fn curve(group: &Group<'_>, name: String, window: usize) -> Curve {
     let lengths = group.runs.iter().map(|run| run.rewards.len());
     let n_steps = lengths.min().unwrap_or(0);
@@ -81,7 +78,6 @@ fn curve(group: &Group<'_>, name: String, window: usize) -> Curve {
     Curve { name, points }
 }
 
-/// Returns the length of the moving average: a round number of steps, about a fortieth of all.
 fn window(n_steps: usize) -> usize {
     let target = (n_steps / WINDOWS).max(1);
     let round = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000];

@@ -16,9 +16,7 @@ pub fn check_runs_file(path: &Path) -> Result<()> {
     check_replaceable(path)
 }
 
-/// Writes one row per run, ordered by policy, then seed. A missing value is an empty field.
-///
-/// Numbers have the shortest text that parses to the same `f64`.
+/// Writes runs, ordered by policy, then seed. Numbers have the shortest text that parses to the same `f64`.
 pub fn write_runs(path: &Path, runs: &[PolicyRun]) -> Result<()> {
     let mut sorted: Vec<&PolicyRun> = runs.iter().collect();
     sorted.sort_by_key(|run| {

@@ -21,17 +21,14 @@ pub const CEILING: &str = "oracle_ahead";
 const SCORES: &str = "Scores: 0 is random_walk's mean reward in a task, 1 is oracle_ahead's. The last column is the \
      interquartile mean over the worlds of all tasks.";
 
-/// Line above a table of policies that lack a task.
 pub(super) const PARTIAL: &str = "Policies that lack a task have no score over all tasks:";
 
-/// Heading of scores over tasks.
 pub(super) const SCORE: &str = "score [95 %]";
 
 const LIKELIHOOD: &str = "Log-likelihood of a visited cell (higher is better):";
 
 const BRIER: &str = "Brier score (lower is better):";
 
-/// Number of bootstrap draws for an interval.
 const N_DRAWS: usize = 10_000;
 
 /// The mean rewards of a policy, the random walk and the oracle in one world.
@@ -109,7 +106,6 @@ pub fn scores(runs: &[PolicyRun], task: &str, policy: &str) -> Vec<f64> {
     scaled(&rewards(runs, task, policy)).unwrap_or_default()
 }
 
-/// Returns the rewards of a policy, the random walk and the oracle, for each world that all three have.
 fn rewards(runs: &[PolicyRun], task: &str, policy: &str) -> Vec<WorldRewards> {
     let by_seed = |policy| -> BTreeMap<u64, f64> {
         let runs = of(runs, task, policy);
@@ -129,8 +125,7 @@ fn of<'a>(
     runs.iter().filter(is_of)
 }
 
-/// Renders the scores of all policies, with one column per task, and the likelihood and Brier score of their beliefs.
-/// Policies that lack a task have a separate table.
+/// Renders the scores of all policies per task, and their beliefs' likelihood and Brier score.
 pub fn render_suite(runs: &[PolicyRun]) -> String {
     let (tasks, policies) = (tasks(runs), by_score(runs));
     let headings = [&["policy"], &*tasks].concat();
@@ -171,7 +166,6 @@ pub fn render_suite(runs: &[PolicyRun]) -> String {
 "
 }
 
-/// Returns a line and the table below it; nothing without rows.
 pub(super) fn table(line: &str, headings: &[&str], rows: Vec<Vec<String>>) -> Vec<String> {
     if rows.is_empty() {
         return Vec::new();
@@ -188,7 +182,6 @@ pub fn score_text(Aggregate { mean, interval }: Aggregate) -> String {
     }
 }
 
-/// Returns the interquartile mean of all worlds' scores; `None` without tasks, or if a task has no scores.
 fn score(tasks: impl Iterator<Item = impl Iterator<Item = WorldRewards>>) -> Option<f64> {
     let scores = tasks.map(|worlds| scaled(&worlds.collect::<Vec<_>>()));
     let scores = scores.collect::<Option<Vec<_>>>()?.concat();
@@ -212,7 +205,6 @@ fn interquartile_mean(mut numbers: Vec<f64>) -> f64 {
     middle.iter().sum::<f64>() / middle.len() as f64
 }
 
-/// Returns a quantile of sorted numbers, by linear interpolation.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
     let at = share * (sorted.len() - 1) as f64;
     let (below, above) = (sorted[at.floor() as usize], sorted[at.ceil() as usize]);

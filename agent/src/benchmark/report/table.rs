@@ -7,12 +7,9 @@ use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::ratio_of_means;
 use std::collections::BTreeSet;
 
-/// Estimator label of the oracles. The table shows rewards as a percentage of the best oracle's reward.
 const TRUTH: &str = "truth";
 
-/// Renders the rewards and figures of merit of every policy over all worlds.
-///
-/// Policies keep their order. `baseline` names the policy that paired differences are relative to.
+/// Renders rewards and figures of merit. `baseline` is the policy that paired differences are relative to.
 pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
     let groups = groups(runs);
     if groups.is_empty() {
@@ -81,7 +78,6 @@ fn rewards(group: &Group<'_>) -> impl Iterator<Item = f64> {
     group.by_seed(reward).into_values()
 }
 
-/// Renders a group's reward as a percentage of the reward of the best oracle with the same number of robots.
 fn percent_of_oracle(group: &Group<'_>, groups: &[Group<'_>]) -> String {
     let wanted = (TRUTH, group.robots);
     let oracles = groups.iter();

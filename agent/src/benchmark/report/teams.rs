@@ -32,7 +32,6 @@ pub fn teams(runs: &[PolicyRun], axis_label: &str) -> Lines {
     }
 }
 
-/// Returns a team's curve. The curve's name includes the policy if several policies have this kind of team.
 fn curve((policy, team): (&str, &str), kinds: &[(&str, &str)], groups: &[Group<'_>]) -> Curve {
     let n_twins = kinds.iter().filter(|kind| kind.1 == team).count();
     let name = match n_twins {

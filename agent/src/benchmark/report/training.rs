@@ -10,7 +10,6 @@ use std::path::Path;
 /// The figure's name in the folder of a training.
 pub const FIGURE: &str = "training.svg";
 
-/// Maximum number of points of a curve. Each point is the mean over a part of the rows.
 const POINTS: usize = 200;
 
 pub fn draw_training(folder: &Path) -> Result<()> {
@@ -66,8 +65,6 @@ fn panels(rows: &Rows) -> Vec<Panel> {
     panels.map(panel).into()
 }
 
-/// Returns a column's means over equal parts of the rows, each at the part's last world step. If a part has several
-/// rows, its mean has a standard error.
 fn averages(rows: &Rows, column: &str, name: &str) -> Curve {
     let (steps, values) = (rows.column("world_steps"), rows.column(column));
     let part = rows.len().div_ceil(POINTS).max(1);

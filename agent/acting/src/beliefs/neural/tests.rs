@@ -1,11 +1,17 @@
 use super::*;
 use crate::testing::learned_filter;
-use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_network::{Device, Lesson};
 
+fn network(seed: u64) -> NeuralBelief {
+    NeuralBelief::new(3, seed, &Device::Cpu).expect("a network")
+}
+
+fn estimator_on(network: &NeuralBelief, filter: Option<Box<dyn Filter>>) -> NeuralEstimator {
+    NeuralEstimator::new(network, filter, shape()).expect("a belief")
+}
+
 fn estimator() -> NeuralEstimator {
-    let network = NeuralBelief::new(3, 1, &Device::Cpu).expect("a network");
-    NeuralEstimator::new(&network, None, shape()).expect("a belief")
+    estimator_on(&network(1), None)
 }
 
 fn shape() -> Shape {
@@ -35,15 +41,13 @@ fn visited_cells_are_certain_until_the_next_step() {
 }
 
 fn filter() -> Box<dyn Filter> {
-    let model = emberwatch_model::Model::wildfire();
-    let filter = BayesFilter::known(&model, Belief::uniform(3, shape()), false);
-    Box::new(filter.expect("a filter"))
+    learned_filter().estimator(false, shape())
 }
 
 #[test]
 fn predictions_together_equal_predictions_alone() {
     let networks = [1, 2].map(|seed| {
-        let mut network = NeuralBelief::new(3, seed, &Device::Cpu).expect("a network");
+        let mut network = network(seed);
         let lesson = Lesson {
             before: Sightings::new(shape()),
             frame: vec![(0, 1), (4, 2)],
@@ -58,8 +62,7 @@ fn predictions_together_equal_predictions_alone() {
         // The two networks alternate, each with and without a filter to correct.
         for index in 0..8 {
             let below = (index % 4 > 1).then(filter);
-            let estimator = NeuralEstimator::new(&networks[index % 2], below, shape());
-            let mut estimator = estimator.expect("a belief");
+            let mut estimator = estimator_on(&networks[index % 2], below);
             let seen = [255, 255, index as u8 % 3, 255, 1, 255];
             estimator.correct(&frame(&seen)).expect("possible");
             all.push(Box::new(estimator));
@@ -78,21 +81,16 @@ fn predictions_together_equal_predictions_alone() {
 
 #[test]
 fn equal_models_have_equal_targets_filters_and_parameters() {
-    let model = |seed, filter: Option<LearnedModel>, target| NeuralModel {
-        network: NeuralBelief::new(3, seed, &Device::Cpu).expect("a network"),
-        filter: filter.map(Box::new),
+    let model = |seed, has_filter: bool, target| NeuralModel {
+        network: network(seed),
+        filter: has_filter.then(|| Box::new(learned_filter())),
         target,
     };
-    let learned = || Some(learned_filter());
-    let first = model(1, learned(), 1);
-    assert!(first == model(1, learned(), 1));
-    for other in [
-        model(1, learned(), 2),
-        model(1, None, 1),
-        model(2, learned(), 1),
-    ] {
-        assert!(first != other);
-    }
+    let first = model(1, true, 1);
+    assert!(first == model(1, true, 1));
+    assert!(
+        first != model(1, true, 2) && first != model(1, false, 1) && first != model(2, true, 1)
+    );
 }
 
 #[test]
@@ -106,7 +104,29 @@ fn restored_bytes_result_in_the_same_belief() {
     assert!(!second.restore(&bytes[1..]) && second.sightings == Sightings::new(shape()));
     assert!(second.restore(&bytes));
     assert_eq!((second.to_bytes(), second.kind()), (bytes, first.kind()));
-    let other = NeuralBelief::new(3, 2, &Device::Cpu).expect("a network");
-    let other = NeuralEstimator::new(&other, None, shape()).expect("a belief");
-    assert_ne!(other.kind(), first.kind());
+    assert_ne!(estimator_on(&network(2), None).kind(), first.kind());
+}
+
+#[test]
+fn a_refused_frame_changes_nothing() {
+    for has_filter in [false, true] {
+        let new = || estimator_on(&network(1), has_filter.then(filter));
+        let (mut one, mut other) = (new(), new());
+        for step in 0..3 {
+            for estimator in [&mut one, &mut other] {
+                let mut seen = [255; 6];
+                (seen[step], seen[5]) = (0, 1);
+                estimator.correct(&frame(&seen)).expect("possible");
+            }
+            // The first cell is possible. The last one was seen as another value in this step.
+            let refused = one.correct(&frame(&[255, 255, 255, 2, 255, 2]));
+            assert!(refused.is_err());
+            for _ in 0..2 {
+                assert_eq!(one.to_bytes(), other.to_bytes());
+                assert!(one.belief() == other.belief());
+                one.predict();
+                other.predict();
+            }
+        }
+    }
 }

@@ -11,24 +11,19 @@ use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::planning::OPTIONS;
 use emberwatch_belief::planning::options::N_FEATURES;
 use emberwatch_model::randomness::split_mix;
-use emberwatch_model::{Cell, Frame, Grid, Model};
+use emberwatch_model::{Cell, Frame, Model};
 use emberwatch_network::{Dqn, DqnShape};
 use std::sync::Arc;
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
 
-/// Returns hidden states, and a frame that shows the states of some cells.
-fn world(step: u64) -> (Grid<u8>, Frame) {
-    let states = Grid::from_shape_fn(shape().dim(), |(row, col)| {
-        (split_mix(step / 3, (row / 3 * 3 + col / 3) as u64) % 3) as u8
-    });
+/// A frame that shows some cells of a made-up world.
+fn frame() -> Frame {
     let mut frame = Frame::empty(shape());
-    for (cell, &state) in states.iter().enumerate() {
-        if split_mix(step + 100, cell as u64).is_multiple_of(4) {
-            frame.observe(cell, state);
-        }
+    for cell in (0..72).filter(|cell| split_mix(100, *cell).is_multiple_of(4)) {
+        frame.observe(cell as usize, (split_mix(0, cell / 3) % 3) as u8);
     }
-    (states, frame)
+    frame
 }
 
 fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent> {
@@ -76,7 +71,7 @@ fn decisions_use_the_beam_width_that_they_were_learned_with() {
         let [narrow, wide] = [1, 30].map(|width| {
             config.decisions.beam_width = width;
             let mut agent = agent(policy, &config, &learned).expect("an agent");
-            agent.correct(&world(0).1, None).expect("possible");
+            agent.correct(&frame(), None).expect("possible");
             agent.predict();
             agent.plan(&[ROBOT], 0)
         });
@@ -89,7 +84,7 @@ fn a_network_decides_from_the_hidden_vector_after_the_frame() {
     let learned = network(|_| true).autoencoder;
     let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");
     let before = estimator.hidden().to_vec();
-    estimator.correct(&world(0).1).expect("possible");
+    estimator.correct(&frame()).expect("possible");
     let after = estimator.hidden().to_vec();
     let network = network(|dqn| dqn.best(&before) != dqn.best(&after));
     let best = network.dqn.best(&after);
@@ -98,7 +93,7 @@ fn a_network_decides_from_the_hidden_vector_after_the_frame() {
     let mut learned = Learned::default();
     learned.put(network);
     let mut agent = agent("autoencoder/shooting/learned", &config, &learned).expect("an agent");
-    agent.correct(&world(0).1, None).expect("possible");
+    agent.correct(&frame(), None).expect("possible");
     agent.predict();
     agent.plan(&[ROBOT], 0);
     let aim = agent.intent(std::time::Duration::ZERO).objective;

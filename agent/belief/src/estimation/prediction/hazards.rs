@@ -26,7 +26,6 @@ use emberwatch_model::{Cell, Shape};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Maximum deviation from 1 of a distribution's sum that is left uncorrected.
 const MAX_DRIFT: f32 = 1e-5;
 
 /// The predictions of one world, with its belief and cavities in planes.
@@ -34,15 +33,12 @@ const MAX_DRIFT: f32 = 1e-5;
 pub struct HazardPrediction {
     shape: Shape,
     n_states: usize,
-    /// The transitions of each state.
     changes: Arc<[Vec<Change>]>,
-    /// The state that counts as susceptible, if there are cavities.
     susceptible: Option<usize>,
     /// For each neighbour, the offset from the cell's index in a plane to the neighbour's index. The opposite of
     /// neighbour `l` is neighbour `n - 1 - l`.
     offsets: Vec<isize>,
     pub beliefs: PaddedBeliefs,
-    /// Buffer for the cavities after the next prediction.
     next: PaddedBeliefs,
     work: Work,
 }
@@ -50,7 +46,6 @@ pub struct HazardPrediction {
 /// The first `k` transitions of cells in one state.
 #[derive(Debug)]
 struct Change {
-    /// The next state by transition `k`.
     to: usize,
     /// `b_k`.
     base: Values,
@@ -66,17 +61,14 @@ struct Neighbour {
     sources: Vec<(usize, Values)>,
 }
 
-/// A number for all cells, or a plane of one number per cell.
 #[derive(Debug)]
 enum Values {
     One(f32),
     Plane(Vec<f32>),
 }
 
-/// Work space of the prediction of one chunk of cells.
 #[derive(Debug, Clone)]
 struct Work {
-    /// The probability of each next state.
     next: Vec<Lanes>,
     /// The same for each cavity, as `[cavity][state]`.
     next_cavities: Vec<Lanes>,
@@ -84,7 +76,6 @@ struct Work {
     rest: Vec<Lanes>,
     /// For each cavity, the probability of one of the transitions so far.
     last: Vec<Lanes>,
-    /// For each neighbour, the probability that it causes one of the transitions.
     by_neighbour: Vec<Lanes>,
 }
 
@@ -156,7 +147,6 @@ impl HazardPrediction {
         std::mem::swap(&mut self.beliefs, &mut self.next);
     }
 
-    /// Computes the next-state distributions of the cells of a chunk that starts at index `place` of a plane.
     #[inline(always)] // So that `vectorised` compiles it for this processor's vector instructions.
     fn predict_chunk(&mut self, changes: &[Vec<Change>], place: usize) {
         let n_cavities = self.beliefs.n_cavities;
@@ -260,7 +250,6 @@ impl HazardPrediction {
         lanes_from(&self.beliefs.probabilities, plane + place)
     }
 
-    /// Writes the results of a chunk that starts at `[row, col]` to the belief and the next cavities.
     #[inline(always)]
     fn store(&mut self, [row, col]: [usize; 2], belief: &mut [f32]) {
         let n_lanes = LANES.min(self.shape.width() - col);
@@ -281,7 +270,6 @@ impl HazardPrediction {
     }
 }
 
-/// Writes the first lanes of each state's probabilities to planes that start `plane_length` values apart.
 #[inline(always)]
 fn write(next: &[Lanes], planes: &mut [f32], plane_length: usize, n_lanes: usize) {
     let mut sums = [0.0; LANES];
@@ -292,9 +280,7 @@ fn write(next: &[Lanes], planes: &mut [f32], plane_length: usize, n_lanes: usize
     correct_drift(planes, plane_length, &sums[..n_lanes]);
 }
 
-/// Normalises distributions whose rounding errors have added up, as happens in a cell that is never seen.
-///
-/// The planes of two successive states start `plane_length` values apart, and each lane contains one distribution.
+/// Rounding errors add up in a cell that is never seen.
 #[inline(always)]
 fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
     if sums.iter().all(|sum| (sum - 1.0).abs() <= MAX_DRIFT) {
@@ -306,7 +292,6 @@ fn correct_drift(planes: &mut [f32], plane_length: usize, sums: &[f32]) {
     }
 }
 
-/// Computes `to += here (any - last)`.
 #[inline(always)]
 fn add_difference(to: &mut Lanes, here: &Lanes, any: &Lanes, last: &Lanes) {
     for lane in 0..LANES {
@@ -323,7 +308,6 @@ fn or(any: &mut Lanes, event: &Lanes) {
 }
 
 impl Values {
-    /// Like [`or`], with these values as the probabilities of the event.
     #[inline(always)]
     fn or(&self, any: &mut Lanes, place: usize) {
         match self {
@@ -332,7 +316,6 @@ impl Values {
         }
     }
 
-    /// Computes `to += self by`.
     #[inline(always)]
     fn add_product(&self, to: &mut Lanes, by: &Lanes, place: usize) {
         match self {
@@ -342,11 +325,9 @@ impl Values {
     }
 }
 
-/// Makes the tables of a grid.
 struct Builder<'a> {
     shape: Shape,
     planes: &'a Planes,
-    /// The neighbours' offsets, in ascending order.
     offsets: &'a [[isize; 2]],
 }
 
@@ -405,7 +386,6 @@ impl Builder<'_> {
         neighbours
     }
 
-    /// Computes a number for all cells or for each.
     fn values(&self, is_alike: bool, value: impl Fn(Cell) -> f64) -> Values {
         if is_alike {
             return Values::One(value(Cell { row: 0, col: 0 }) as f32);

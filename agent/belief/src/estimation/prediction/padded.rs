@@ -96,8 +96,7 @@ impl PaddedBeliefs {
         true
     }
 
-    /// Multiplies each cell's cavities by the factors that turn the belief `before` into `after`, both `[S, H, W]`, and
-    /// normalises the products.
+    /// Multiplies cavities by the factors that turn `before` into `after`, both `[S, H, W]`, and normalises them.
     pub fn correct_cavities(&mut self, before: &[f32], after: &[f32]) {
         let mut factors = vec![[1.0; LANES]; self.n_states];
         vectorised(
@@ -112,7 +111,6 @@ impl PaddedBeliefs {
         );
     }
 
-    /// Corrects the cavities of the chunk of cells that starts at `[row, col]`.
     #[inline(always)]
     fn correct_chunk(
         &mut self,
@@ -149,9 +147,6 @@ impl PaddedBeliefs {
     }
 }
 
-/// Computes the factors that turn `before` into `after`, for each state and cell of a chunk. The values of successive
-/// states are `n_cells` apart.
-///
 /// Returns whether each cell's belief has changed.
 #[inline(always)]
 fn correction_factors(

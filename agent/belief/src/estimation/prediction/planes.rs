@@ -32,8 +32,7 @@ impl Planes {
         (row + self.margin[0]) * self.stride + col + self.margin[1]
     }
 
-    /// Returns the offset from a cell's index to a neighbour's index, given the neighbour's row and column relative to
-    /// the cell.
+    /// Returns the offset from a cell's index to that of the neighbour at this relative row and column.
     pub fn offset(&self, [row, col]: [isize; 2]) -> isize {
         row * self.stride as isize + col
     }

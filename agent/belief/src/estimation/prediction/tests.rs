@@ -28,20 +28,20 @@ fn belief(n_states: usize, shape: Shape) -> Belief {
     Belief::from_probabilities(numbers / sums).expect("a belief")
 }
 
-/// Returns a model of three states from the lines that describe its transitions.
+/// Returns a model of three states from the lines that describe its transitions. A sensor shows the state with
+/// probability .9.
 fn model(transitions: &str) -> Model {
-    let state = |name: &str, initial: f64| {
-        format!(
-            "{{ name = \"{name}\", color = \"#000000\", initial = {initial:?}, observed_as = [1.0] }}"
-        )
-    };
-    let states =
-        [("green", 0.9), ("fire", 0.1), ("ash", 0.0)].map(|(name, initial)| state(name, initial));
-    let text = format!(
-        "name = \"fire\"\nstates = [{}]\nobservations = [{{ name = \"x\", color = \"#000000\" }}]\n{transitions}",
-        states.join(", ")
-    );
-    Model::from_toml(&text).expect("a model")
+    let mut text = "name = \"fire\"\n".to_owned();
+    for (name, initial, seen) in [
+        ("green", 0.9, [0.9, 0.05, 0.05]),
+        ("fire", 0.1, [0.05, 0.9, 0.05]),
+        ("ash", 0.0, [0.05, 0.05, 0.9]),
+    ] {
+        let both = format!("name = \"{name}\"\ncolor = \"#000000\"\n");
+        text += &format!("[[observations]]\n{both}[[states]]\n{both}");
+        text += &format!("initial = {initial:?}\nobserved_as = {seen:?}\n");
+    }
+    Model::from_toml(&(text + transitions)).expect("a model")
 }
 
 /// A cell ignites with probability `1 - .6^f` if `f` of its four neighbours burn, and burns out with probability .1.
@@ -95,12 +95,6 @@ fn framed(inner: &Belief) -> Belief {
     let mut cells = framed.slice_mut(s![.., 2..height + 2, 2..width + 2]);
     cells.assign(&inner.view());
     Belief::from_probabilities(framed).expect("a belief")
-}
-
-/// Returns the largest difference between two beliefs.
-fn off(got: &Probabilities, expected: &Probabilities) -> f32 {
-    let differences = (got - expected).mapv(f32::abs);
-    differences.fold(0.0, |worst, d| d.max(worst))
 }
 
 /// Returns the prediction without cavities, from the formula of the module's page, in double precision.
@@ -170,61 +164,33 @@ fn with_maps(model: &Model, shape: Shape) -> Model {
     Model::new(file).expect("a model")
 }
 
+/// Checks a prediction to the formula, with a tolerance relative to the probability and an absolute one.
+fn check_formula(model: &Model, mut belief: Belief, tolerance: [f64; 2]) {
+    let expected = formula(model, &belief);
+    let mut prediction = Prediction::known(model, &belief, false).expect("fits");
+    prediction.predict(&mut belief);
+    for (got, expected) in belief.as_slice().iter().zip(&expected) {
+        let off = (f64::from(*got) - expected).abs();
+        let is_close = off <= tolerance[0] * expected + tolerance[1];
+        assert!(is_close, "{got} for {expected}");
+    }
+}
+
 #[test]
 fn predictions_are_those_of_the_formula() {
     for shape in [shape(9, 37), shape(1, 1), shape(2, 64)] {
         let [fire, tangle] = [FIRE, TANGLE].map(model);
         let land = with_maps(&fire, shape);
-        let models = [with_edge(&tangle), tangle, with_edge(&land), land, fire];
-        for model in models {
-            let mut belief = belief(3, shape);
-            let expected = formula(&model, &belief);
-            let mut prediction = Prediction::known(&model, &belief, false).expect("fits");
-            prediction.predict(&mut belief);
-            let off = (belief.view().mapv(f64::from) - expected).mapv(f64::abs);
-            assert!(off.iter().all(|off| *off < 1e-6), "{off}");
+        for model in [with_edge(&tangle), tangle, with_edge(&land), land, fire] {
+            check_formula(&model, belief(3, shape), [0.0, 1e-6]);
         }
-    }
-}
-
-/// Returns the text of random transitions, with probabilities from 1e-7 to .7 and tables of up to 5 x 5 cells.
-fn random_transitions(seed: u64) -> String {
-    let mut at = 0..;
-    let mut random = || random(seed, at.next().expect("endless"));
-    let mut text = String::new();
-    for (from, to) in [(0, 1), (1, 2), (2, 0)] {
-        let [from, to] = [from, to].map(|state| ["green", "fire", "ash"][state]);
-        let mut p = |scale: f64| scale * (1e-7_f64 / 0.7).powf(random());
-        text += &format!(
-            "[[transitions]]\nfrom = \"{from}\"\nto = \"{to}\"\nbase = {:?}\n",
-            p(0.1)
-        );
-        for (index, source) in ["fire", "ash"].into_iter().enumerate() {
-            let side = 1 + 2 * ((seed as usize + index) % 3);
-            let mut rows = vec![vec![0.0; side]; side];
-            let cells = rows.iter_mut().flatten().enumerate();
-            cells.for_each(|(cell, it)| *it = if cell == side * side / 2 { 0.0 } else { p(0.7) });
-            text += &format!("near.{source} = {rows:?}\n");
-        }
-    }
-    text
-}
-
-#[test]
-fn a_cell_is_predicted_to_a_relative_1e_5_by_a_thousand_random_models() {
-    for seed in 0..1000 {
-        let model = model(&random_transitions(seed));
-        let states = Grid::from_shape_fn((5, 6), |(row, col)| {
-            (3.0 * random(seed, row * 6 + col)) as u8
+        // Rare events are not rounded to 0 or to a multiple of 6e-8.
+        let rare = model(&FIRE.replace("0.4", "1e-7"));
+        let states = Grid::from_shape_fn(shape.dim(), |(row, col)| {
+            (3.0 * random(7, row * 100 + col)) as u8
         });
-        let mut belief = Belief::from_states(&states, 3).expect("states");
-        let expected = formula(&model, &belief);
-        let mut prediction = Prediction::known(&model, &belief, false).expect("fits");
-        prediction.predict(&mut belief);
-        for (got, expected) in belief.as_slice().iter().zip(&expected) {
-            let off = (f64::from(*got) - expected).abs();
-            assert!(off <= 1e-5 * expected, "{seed}: {got} for {expected}");
-        }
+        let certain = Belief::from_states(&states, 3).expect("states");
+        check_formula(&rare, certain, [1e-5, 0.0]);
     }
 }
 
@@ -243,8 +209,8 @@ fn an_edge_state_equals_a_border_of_cells_in_that_state() {
             prediction.predict(&mut got);
             of_frame.predict(&mut expected);
             let inner = expected.view().slice(s![.., 2..7, 2..9]).to_owned();
-            let off = off(got.probabilities(), &inner);
-            assert!(off < 2e-6, "{cavities}, step {step}: {off}");
+            let off = (got.probabilities() - &inner).mapv(f32::abs);
+            assert!(off.iter().all(|off| *off < 2e-6), "{cavities}, step {step}");
             let reset = framed(&got);
             of_frame.correct(expected.as_slice(), reset.as_slice());
             expected = reset;
@@ -257,8 +223,8 @@ fn cavities_are_closer_to_the_exact_filter() {
     // Bounds are 10 % above the measured values.
     for (dim, one_in, n_worlds, bounds) in [
         ((2, 3), 0, 1, [0.097, 0.065]),
-        ((2, 3), 5, 40, [0.163, 0.106]),
-        ((2, 3), 1, 40, [0.0065, 0.006]),
+        ((2, 3), 5, 40, [0.104, 0.067]),
+        ((2, 3), 2, 40, [0.0147, 0.0117]),
         ((3, 3), 0, 1, [0.119, 0.080]),
     ] {
         let off = divergences(&model(FIRE), shape(dim.0, dim.1), one_in, n_worlds);
@@ -270,36 +236,10 @@ fn cavities_are_closer_to_the_exact_filter() {
 
 #[test]
 fn the_paper_s_rule_has_no_cavities() {
-    let model = Model::wildfire();
-    let mut plain = belief(3, shape(6, 7));
-    let mut with = plain.clone();
-    let mut prediction = Prediction::known(&model, &plain, true).expect("fits");
+    let belief = belief(3, shape(6, 7));
+    let mut prediction = Prediction::known(&Model::wildfire(), &belief, true).expect("fits");
     assert!(!prediction.has_cavities() && prediction.to_bytes().is_empty());
-    prediction.predict(&mut with);
-    let mut prediction = Prediction::known(&model, &plain, false).expect("fits");
-    prediction.predict(&mut plain);
-    assert_eq!(with, plain);
     assert!(prediction.restore(&[]) && !prediction.restore(&[0; 4]));
-}
-
-/// Returns the sums over states of all cavities.
-fn sums_of_cavities(prediction: &Prediction, n_cells: usize) -> Vec<f32> {
-    let bytes = prediction.to_bytes();
-    let numbers = bytes
-        .as_chunks()
-        .0
-        .iter()
-        .map(|bytes| f32::from_le_bytes(*bytes));
-    let numbers: Vec<f32> = numbers.collect();
-    let sum = |cells: &[f32]| {
-        (0..n_cells)
-            .map(|cell| cells[cell..].iter().step_by(n_cells).sum())
-            .collect()
-    };
-    numbers
-        .chunks_exact(3 * n_cells)
-        .flat_map(|cells| -> Vec<f32> { sum(cells) })
-        .collect()
 }
 
 #[test]
@@ -310,33 +250,13 @@ fn unseen_cells_and_cavities_keep_summing_to_one() {
     ] {
         let mut belief = belief(3, shape(3, 35));
         let mut prediction = Prediction::known(&model, &belief, true).expect("fits");
-        for _ in 0..2_000 {
+        for _ in 0..5_000 {
             prediction.predict(&mut belief);
         }
-        let sums = belief.view().sum_axis(Axis(0)).into_iter();
-        let cavities = sums_of_cavities(&prediction, 3 * 35);
-        assert!(!cavities.is_empty());
-        for sum in sums.chain(cavities) {
-            assert!((sum - 1.0).abs() < 3e-5, "{sum}");
-        }
-    }
-}
-
-#[test]
-fn a_correction_changes_only_the_cavities_of_its_cells() {
-    let states = Grid::from_shape_vec((1, 5), vec![1, 0, 0, 0, 0]).expect("a grid");
-    let mut belief = Belief::from_states(&states, 3).expect("states");
-    let mut prediction = Prediction::known(&model(FIRE), &belief, true).expect("fits");
-    prediction.predict(&mut belief);
-    let cavities = prediction.to_bytes();
-    let (before, mut after) = (belief.as_slice().to_vec(), belief.as_slice().to_vec());
-    (0..3).for_each(|state| after[state * 5] = [0.1, 0.8, 0.1][state]);
-    prediction.correct(&before, &after);
-    let corrected = prediction.to_bytes();
-    assert_ne!(corrected, cavities);
-    let cells = corrected.chunks(4).zip(cavities.chunks(4)).enumerate();
-    for (index, (after, before)) in cells {
-        assert!(index % 5 == 0 || after == before, "{index}");
+        assert!(prediction.has_cavities());
+        let bytes = [belief.to_bytes(), prediction.to_bytes()].concat();
+        let mut beliefs = bytes.chunks(4 * 3 * 3 * 35);
+        assert!(beliefs.all(|bytes| Belief::from_bytes(bytes, (3, 3, 35)).is_some()));
     }
 }
 
@@ -350,20 +270,14 @@ fn only_valid_cavities_are_restored() {
     let (bytes, unchanged) = (first.to_bytes(), second.to_bytes());
     // Four cavities per cell, each with three `f32`.
     assert_eq!(bytes.len(), 4 * 4 * 3 * 3 * 35);
-    let with = |number: usize, p: f32| {
-        let mut bytes = bytes.clone();
-        bytes[4 * number..][..4].copy_from_slice(&p.to_le_bytes());
-        bytes
-    };
-    let last = bytes.len() / 4 - 1;
+    let mut negative = bytes.clone();
+    *negative.last_mut().expect("a number") |= 0x80;
     for (name, refused) in [
         ("nothing", Vec::new()),
         ("a value too few", bytes[4..].to_vec()),
         ("a byte too many", [&bytes[..], &[0]].concat()),
         ("zeros", vec![0; bytes.len()]),
-        ("a sum above 1", with(0, 1.0005)),
-        ("a negative number", with(last, -0.5)),
-        ("not a number", with(last, f32::NAN)),
+        ("a negative number", negative),
     ] {
         assert!(!second.restore(&refused), "{name}");
         assert_eq!(second.to_bytes(), unchanged, "{name}");

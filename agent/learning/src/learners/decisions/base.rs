@@ -9,10 +9,7 @@ use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Model, Shape};
 
-/// Finds the belief that decisions are based on, given the setting `decisions.estimator`.
-///
-/// # Errors
-/// If there is no such belief. The error lists all valid names.
+/// Finds the belief of the setting `decisions.estimator`. The error lists all valid names.
 pub fn belief_of(name: &str) -> Result<&'static BeliefKind> {
     let kind = beliefs::of_options(name);
     kind.map_err(|problem| anyhow::anyhow!("decisions.estimator: {problem}"))
@@ -22,10 +19,8 @@ pub fn belief_of(name: &str) -> Result<&'static BeliefKind> {
 pub struct Base {
     pub kind: &'static BeliefKind,
     shape: Shape,
-    /// The model and the first belief, for kinds that know the model.
     known: Option<(Model, Belief)>,
     pub(super) learned: Learned,
-    /// The state with the highest reward.
     pub(super) target: usize,
     pub(super) state_names: Vec<String>,
 }
@@ -54,7 +49,6 @@ impl Base {
         Ok(base)
     }
 
-    /// Creates the base for `decisions.estimator`: a learned belief, or a filter with the server's model.
     pub(super) fn of_settings(on: &LearnerInputs<'_>) -> Result<Self> {
         let (config, shape) = (on.config, on.worlds.shape());
         let kind = belief_of(&config.decisions.estimator)?;

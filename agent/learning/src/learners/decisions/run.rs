@@ -5,7 +5,6 @@ use emberwatch_belief::planning::Proposal;
 use emberwatch_model::Move;
 use emberwatch_network::{Dqn, Track, Transition};
 
-/// A random option that is flown for several steps in a row, and the remaining steps.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Held {
     pub(super) option: usize,
@@ -18,7 +17,6 @@ pub(super) struct Run {
     pub(super) last: Option<(Vec<f32>, f32)>,
     pub(super) track: Track,
     pub(super) held: Held,
-    /// The option that is flown next, with its plan.
     pub(super) next: Option<(usize, Proposal)>,
 }
 
@@ -39,7 +37,6 @@ impl Run {
         self.acting.agent.propose(cell)
     }
 
-    /// Returns the path of the chosen option.
     pub(super) fn take_up(&mut self) -> Vec<Move> {
         let next = self.next.take();
         let (option, proposal) = next.expect("invariant: an option was chosen");
@@ -47,8 +44,6 @@ impl Run {
         self.acting.agent.take_up(option, proposal).moves
     }
 
-    /// Adds the last step, which led to the given features of all options. Returns the transition that this step
-    /// completes, if any.
     pub(super) fn led_to(&mut self, features: &[f32], dqn: &Dqn) -> Option<Transition> {
         let (input, reward) = self.last.take()?;
         let is_terminated = self.acting.observation().world.terminated != 0;
@@ -70,7 +65,6 @@ impl Run {
     }
 }
 
-/// Concatenates the features of all options.
 pub(super) fn features(proposals: &[Proposal]) -> Vec<f32> {
     proposals.iter().flat_map(|it| it.features).collect()
 }

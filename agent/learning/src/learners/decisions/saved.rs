@@ -21,7 +21,6 @@ pub const SHAPE: DqnShape = DqnShape::of_candidates(N_FEATURES, OPTIONS.len());
 
 const NOTHING: &str = "decisions: expected a checkpoint of a learned belief, got none";
 
-/// Prefix of the names of the belief's tensors.
 pub(super) const BELIEF: &str = "belief.";
 
 /// A checkpoint of decisions, without its tensors.
@@ -35,7 +34,6 @@ pub struct SavedDecisions {
     pub world_steps: u64,
 }
 
-/// A learned belief, without its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) enum SavedBelief {
     Filter(Box<SavedModel>),
@@ -43,7 +41,6 @@ pub(super) enum SavedBelief {
 }
 
 impl SavedBelief {
-    /// Returns the learned model of a kind of belief, and its tensors. `None` if the kind needs no learned model.
     pub(super) fn of(
         kind: &BeliefKind,
         learned: &Learned,
@@ -74,7 +71,6 @@ impl SavedBelief {
     }
 }
 
-/// Loads the values that policies use: the decisions, and their belief if it was learned. Networks compute on `device`.
 /// Returns whether it replaced different decisions.
 pub(super) fn read(contents: &Contents, device: &Device, learned: &mut Learned) -> Result<bool> {
     let config = contents.settings()?;
@@ -108,7 +104,7 @@ impl SavedDecisions {
         base.transpose()
     }
 
-    /// Loads the learned belief, if any. Networks compute on `device`. Returns whether it replaced a different belief.
+    /// Returns whether it replaced a different belief.
     pub(super) fn read_belief(
         &self,
         contents: &Contents,

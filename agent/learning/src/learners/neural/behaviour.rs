@@ -7,7 +7,6 @@ use emberwatch_network::Sightings;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 
-/// Average number of steps between changes of behaviour.
 const STEPS: u64 = 20;
 
 /// Time constants in steps: how fast a seen cell regains its value for the aim `Cover`, and how fast an old sighting
@@ -23,16 +22,15 @@ pub struct Behaviour {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Aim {
-    /// Random moves.
     Walk,
-    /// Cells that have not been seen for a long time.
     Cover,
-    /// The goal cell.
     Far,
     /// Cells in which the observation with the highest reward was seen recently.
     Last,
     /// The policy's objective on the belief, plus `entropy / 10` times the belief's entropy.
-    Exploit { entropy: u8 },
+    Exploit {
+        entropy: u8,
+    },
 }
 
 /// Each aim with its two probabilities in per cent: while exploring, and later.
@@ -48,8 +46,7 @@ const AIMS: [(Aim, [u64; 2]); 8] = [
 ];
 
 impl Behaviour {
-    /// Returns the next behaviour: a random one with probability 1 / `STEPS` or at the beginning, otherwise the
-    /// previous one.
+    /// Returns another random behaviour with probability 1 / `STEPS` or at the beginning, otherwise the previous one.
     pub fn next(
         before: Option<Self>,
         is_exploring: bool,
@@ -104,7 +101,6 @@ impl Behaviour {
         }
     }
 
-    /// Computes the value of each cell for an aim that ignores the belief.
     fn value(&self, seen: &Sightings, target: usize, rng: &mut ChaCha8Rng) -> Grid<f32> {
         let shape = seen.shape();
         let (height, width) = shape.dim();
@@ -149,21 +145,21 @@ mod tests {
             assert_eq!(sum, 100);
         }
         let mut rng = stream(1, Purpose::Exploration, 0);
-        let (mut behaviour, mut counts, mut n_changes) = (None, [0; AIMS.len()], 0);
+        let mut next = |before| Behaviour::next(before, false, shape(), &mut rng);
+        let (mut behaviour, mut n_changes) = (next(None), 0);
         for _ in 0..20_000 {
-            let next = Behaviour::next(behaviour, false, shape(), &mut rng);
-            n_changes += u32::from(behaviour != Some(next));
-            let aim = AIMS.iter().position(|(aim, _)| *aim == next.aim);
-            counts[aim.expect("an aim")] += 1;
-            behaviour = Some(next);
+            let before = behaviour;
+            behaviour = next(Some(before));
+            n_changes += u32::from(behaviour != before);
         }
         // About 1,000 behaviours are drawn, of which 8 % equal the previous behaviour.
         assert!((850..1050).contains(&n_changes), "{n_changes}");
-        for (count, (aim, chances)) in counts.iter().zip(AIMS) {
-            // Three standard deviations of a share of 1,000 draws are at most .045. The tolerance is wider, because
-            // durations vary as well.
-            let off = f64::from(*count) / 20_000.0 - chances[1] as f64 / 100.0;
-            assert!(off.abs() < 0.08, "{aim:?} {off}");
+        let drawn: Vec<Aim> = (0..20_000).map(|_| next(None).aim).collect();
+        for (aim, chances) in AIMS {
+            let share = drawn.iter().filter(|it| **it == aim).count() as f64 / 20_000.0;
+            // Five standard deviations of a share of 20,000 draws are at most .018.
+            let off = share - chances[1] as f64 / 100.0;
+            assert!(off.abs() < 0.018, "{aim:?} {off}");
         }
     }
 
@@ -196,15 +192,9 @@ mod tests {
         // With a wider sensor, coverage and entropy count for all cells in sight.
         let model = Model::wildfire().with_radius(1).expect("a radius");
         let wide = model.airspace(shape()).expect("an airspace");
-        for (aim, in_sight) in [
-            (Aim::Cover, true),
-            (Aim::Far, false),
-            (Aim::Exploit { entropy: 0 }, false),
-            (Aim::Exploit { entropy: 3 }, true),
-        ] {
-            let values = values(aim, &wide);
-            assert_eq!(values.in_sight().is_some(), in_sight, "{aim:?}");
-            assert_eq!(values.airspace(), &wide);
-        }
+        let in_sight = |aim| values(aim, &wide).in_sight().is_some();
+        assert!(in_sight(Aim::Cover) && in_sight(Aim::Exploit { entropy: 3 }));
+        assert!(!in_sight(Aim::Far) && !in_sight(Aim::Exploit { entropy: 0 }));
+        assert_eq!(values(Aim::Far, &wide).airspace(), &wide);
     }
 }

@@ -15,9 +15,7 @@ const KEPT: f64 = 1.0 - 1.0 / 4000.0;
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Neighbours {
     correlations: Correlations,
-    /// The state that the correlations refer to.
     state: Option<usize>,
-    /// Steps since the last observation of each cell, by robot.
     ages: BTreeMap<u32, Ages>,
 }
 
