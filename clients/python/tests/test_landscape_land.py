@@ -181,7 +181,7 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
         "rasters: expected at least one of ELEVATION, --fuel and --no-fly, got none": (),
         "expected a projection, which gives the size of cells, got none; give --cell": (npy,),
         "--cell: expected 30 metres, as ": (dem, "--cell=90"),
-        "--cell: expected at least 0.001 metres, got 0": (npy, "--cell=0"),
+        "--cell: expected 0.001 to 1000000000, got 0": (npy, "--cell=0"),
         f"--factors: expected classes that occur in {fuel}, got 9": (
             "--fuel", fuel, "--factors=1=2,9=0",
         ),

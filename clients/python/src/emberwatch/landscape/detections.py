@@ -5,6 +5,7 @@ A detection becomes a polygon, the footprint of the sensor: a rectangle whose si
 https://www.earthdata.nasa.gov/data/tools/firms/active-fire-data-attributes-modis-viirs
 """
 
+from argparse import Namespace
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.landscape.layers import Choice, Layer
+from emberwatch.landscape.layers import Layer
 from emberwatch.landscape.libraries import library
 from emberwatch.landscape.perimeters import drawn, on_plane, seconds_of
 
@@ -26,7 +27,7 @@ _RANGES: Final = {
 _NEEDED: Final = (*_RANGES, "acq_date", "acq_time")
 
 
-def read(file: Path, choice: Choice) -> Generator[Layer]:
+def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields the arrival times of the detections in a file."""
     geopandas, pandas = library("geopandas"), library("pandas")
     try:
@@ -44,7 +45,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
     points, east, north = on_plane(file, points), 500 * scan, 500 * track  # half the sides, metres
     x, y = points.x, points.y
     footprints = library("shapely").box(x - east, y - north, x + east, y + north)
-    yield drawn(file, geopandas.GeoSeries(footprints, crs=points.crs), seconds, choice)
+    yield drawn(file, geopandas.GeoSeries(footprints, crs=points.crs), seconds, flags)
 
 
 def _numbers(file: Path, table: Any, name: str) -> Any:

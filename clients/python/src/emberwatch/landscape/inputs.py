@@ -1,6 +1,7 @@
 """Finds the files of each sequence, and reads them. Only one layer is in memory at a time."""
 
 import re
+from argparse import Namespace
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape import detections, netcdf, numpy_file, perimeters, raster
-from emberwatch.landscape.layers import Choice, Layer
+from emberwatch.landscape.layers import Layer
 
 _READERS: Final = {
     ".tif": raster.read,
@@ -54,15 +55,15 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
     return [[file] for files in found for file in files] if one_file_each else found
 
 
-def read(files: Iterable[Path], choice: Choice) -> Generator[Layer]:
+def read(files: Iterable[Path], flags: Namespace) -> Generator[Layer]:
     """Yields the layers of files in order. Each file is closed after its last layer."""
     for file in files:
-        if choice.variable is not None and file.suffix.lower() in _UNNAMED:
-            got = f"'{choice.variable}'; leave the flag out"
+        if flags.variable is not None and file.suffix.lower() in _UNNAMED:
+            got = f"'{flags.variable}'; leave the flag out"
             raise InvalidArgumentError(f"--variable: {file} has no variables, got {got}")
-        with closing(_READERS[file.suffix.lower()](file, choice)) as layers:
+        with closing(_READERS[file.suffix.lower()](file, flags)) as layers:
             for layer in layers:
-                for number in choice.nodata:
+                for number in flags.nodata:
                     is_missing = np.isclose(layer.values, number, rtol=_ROUNDED, atol=0.0)
                     layer.values[is_missing] = np.nan
                 yield layer

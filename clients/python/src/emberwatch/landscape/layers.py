@@ -16,18 +16,6 @@ SINCE_1970: Final = "seconds since 1970-01-01"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """The part of each file to read, from the flags (docs/landscapes.md)."""
-
-    variable: str | None = None
-    band: int | None = None
-    nodata: Sequence[float] = ()
-    cell: float | None = None
-    """Side of the cells that perimeters and detections are drawn on, metres; None: refuse these."""
-    time_column: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Layer:
     """One raster."""
 
@@ -70,10 +58,10 @@ def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str
     return wanted or names[0]
 
 
-def choose_bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
+def choose_bands(file: Path, count: int, wanted: int | None) -> Sequence[int]:
     """Returns the numbers of the bands to read, counted from 1."""
-    if choice.band is None:
+    if wanted is None:
         return range(1, count + 1)
-    if choice.band > count:
-        raise invalid("--band", f"1 to {count} for {file}", choice.band)
-    return [choice.band]
+    if wanted > count:
+        raise invalid("--band", f"1 to {count} for {file}", wanted)
+    return [wanted]

@@ -1,6 +1,7 @@
 """Reader of NetCDF files. xarray unpacks numbers and dates; CF attributes state axes and grid."""
 
 import warnings
+from argparse import Namespace
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import Place
-from emberwatch.landscape.layers import SINCE_1970, Choice, Layer, choose_bands, choose_variable
+from emberwatch.landscape.layers import SINCE_1970, Layer, choose_bands, choose_variable
 from emberwatch.landscape.libraries import library
 
 #: Standard names, units and attributes `axis` of coordinates, or names of dimensions, by axis.
@@ -21,7 +22,7 @@ _LAYERS: Final = "t time date step layer band".split()
 _EVEN: Final = 0.1  # tolerance for positions, as a share of a cell, as 32-bit numbers are rounded
 
 
-def read(file: Path, choice: Choice) -> Generator[Layer]:
+def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields a layer for each time of a variable. The file is closed after the last layer."""
     xarray, path = library("xarray"), utf8("file", file.absolute())
     library("rioxarray")  # adds `rio` to arrays
@@ -34,8 +35,8 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
                     for name, array in dataset.data_vars.items()
                     if array.ndim > 1 and array.dtype.kind in "biufM"
                 }
-                name = choose_variable(file, list(arrays), choice.variable)
-                yield from _layers(file, arrays[name], choice)
+                name = choose_variable(file, list(arrays), flags.variable)
+                yield from _layers(file, arrays[name], flags)
         except InvalidArgumentError:
             raise
         except Exception as error:  # netCDF4, xarray and pyproj raise different errors
@@ -43,7 +44,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
             raise InvalidArgumentError(f"{file}: expected a NetCDF file, got: {words}") from None
 
 
-def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
+def _layers(file: Path, array: Any, flags: Namespace) -> Iterator[Layer]:
     if 0 in array.shape:
         raise invalid(file, "cells", f"an array of shape {array.shape}")
     rows = _dimension(array, _ROWS, array.dims[-2])
@@ -57,7 +58,7 @@ def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
     time = array.coords.get(layers if array.ndim == 3 else "time")
     array = array if array.ndim == 3 else array.expand_dims("layer")
     times, time_unit = (None, "") if time is None else _numbers(time)
-    for band in choose_bands(file, len(array), choice):
+    for band in choose_bands(file, len(array), flags.band):
         values, unit = _numbers(array[band - 1])
         yield Layer(
             name=f"{file}, band {band}" if len(array) > 1 else str(file),

@@ -5,6 +5,7 @@ that contains its centre.
 """
 
 import math
+from argparse import Namespace
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
@@ -16,28 +17,28 @@ from emberwatch._native import MAX_SIDE
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import Place
-from emberwatch.landscape.layers import SINCE_1970, Choice, Layer, choose_variable
+from emberwatch.landscape.layers import SINCE_1970, Layer, choose_variable
 from emberwatch.landscape.libraries import library
 
 _MARGIN: Final = 0.1  # unburnt land around the fire, as a share of its longer side
 _DATE: Final = r"\d{4}([-/]?)(?:0[1-9]|1[0-2])\1[0-3]\d(?!\d)"
 
 
-def read(file: Path, choice: Choice) -> Generator[Layer]:
+def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields the arrival times of the perimeters in a file."""
     pyogrio, path = library("pyogrio"), utf8("file", file.absolute())
     library("geopandas")
     try:
         names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
-        name = choose_variable(file, names, choice.variable)
+        name = choose_variable(file, names, flags.variable)
         table = pyogrio.read_dataframe(path, layer=name, datetime_as_string=True)
     except InvalidArgumentError:
         raise
     except Exception as error:  # pyogrio and GDAL have no common base class
         raise InvalidArgumentError(f"{file}: expected perimeters, got: {error}") from None
     shapes = _polygons(file, table)
-    times, unit, note = _times(file, table.drop(columns="geometry"), choice.time_column)
-    yield replace(drawn(file, on_plane(file, shapes), times, choice), unit=unit, notes=(note,))
+    times, unit, note = _times(file, table.drop(columns="geometry"), flags.time_column)
+    yield replace(drawn(file, on_plane(file, shapes), times, flags), unit=unit, notes=(note,))
 
 
 def seconds_of(subject: str, words: Any, form: str = "ISO8601") -> Any:
@@ -66,15 +67,15 @@ def on_plane(file: Path, shapes: Any) -> Any:
     raise invalid(file, "degrees in a zone of UTM", f"{got}; {remedy}")
 
 
-def drawn(file: Path, shapes: Any, times: Any, choice: Choice) -> Layer:
+def drawn(file: Path, shapes: Any, times: Any, flags: Namespace) -> Layer:
     """Draws polygons on a grid, the latest first, so that each cell keeps its first time."""
-    if choice.cell is None:
+    if flags.kind != "arrival" or flags.cell is None:
         expected = "--kind arrival and --cell METRES, the side of the cells to draw polygons on"
         raise invalid(file, expected, "another --kind, or no --cell")
     west, south, east, north = shapes.total_bounds.tolist()
     center = (west + east) / 2, (south + north) / 2
     _, metres = Place(shape=(1, 1), corner=center, crs=shapes.crs).ground() or (1.0, 1.0)
-    side = choice.cell / metres
+    side = flags.cell / metres
     margin = side + _MARGIN * max(east - west, north - south)
     left, top = side * math.floor((west - margin) / side), side * math.ceil((north + margin) / side)
     height, width = (math.ceil((far + margin) / side) for far in (top - south, east - left))

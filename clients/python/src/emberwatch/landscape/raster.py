@@ -1,6 +1,7 @@
 """Reader of GeoTIFF and ESRI ASCII grids, which uses GDAL through rasterio."""
 
 import warnings
+from argparse import Namespace
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,11 @@ import numpy as np
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import LIKE, Place
-from emberwatch.landscape.layers import Choice, Layer, choose_bands
+from emberwatch.landscape.layers import Layer, choose_bands
 from emberwatch.landscape.libraries import library
 
 
-def read(file: Path, choice: Choice) -> Generator[Layer]:
+def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields the bands of a file, which is closed after the last one."""
     is_ascii = file.suffix.lower() == ".asc"
     driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
@@ -25,7 +26,7 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
         try:
             with rasterio.open(path, driver=driver) as source:
                 place = _place(file, source)
-                for band in _bands(file, source, choice):
+                for band in _bands(file, source, flags):
                     # GDAL masks cells by numbers that mean "no value", masks and alpha bands.
                     read = source.read(band, masked=True)
                     values = read.astype(np.promote_types(read.dtype, np.float32)).filled(np.nan)
@@ -43,11 +44,11 @@ def read(file: Path, choice: Choice) -> Generator[Layer]:
             raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
 
 
-def _bands(file: Path, source: Any, choice: Choice) -> Sequence[int]:
+def _bands(file: Path, source: Any, flags: Namespace) -> Sequence[int]:
     """Returns the bands with values. GDAL takes the last of four bytes for an alpha band."""
-    bands = choose_bands(file, source.count, choice)
+    bands = choose_bands(file, source.count, flags.band)
     alpha = [band for band in bands if source.colorinterp[band - 1].name == "alpha"]
-    if alpha and choice.band is None:
+    if alpha and flags.band is None:
         remedy = f"choose with --band; if it is a layer, gdal_edit.py -colorinterp_{alpha[0]} gray"
         raise invalid(file, "bands of layers", f"the alpha band {alpha[0]}; {remedy}")
     return bands
