@@ -1,7 +1,7 @@
 """Recorded worlds from rasters of fires: `python -m emberwatch.landscape IN... --out world.npz`.
 
 Reading needs ``pip install emberwatch[landscape]``. `inputs` finds the files. `raster` (rasterio),
-`netcdf` (xarray), `numpy_file`, `perimeters` and `detections` (geopandas) read the files as
+`netcdf` (xarray), `numpy_file` and `perimeters` (geopandas) read the files as
 `layers`. `times` computes the step of each layer, `grid` measures cells on the ground (pyproj) and
 resamples. `fire` converts times, masks or codes to states, `world` writes the files for
 `emberwatch-server --states`, and `__main__` parses the flags.

@@ -1,6 +1,6 @@
 """Layers, which are values with the positions of their cells, and helpers for all readers."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -48,9 +48,10 @@ def where(cells: NDArray[np.bool_]) -> str:
     return f"in row {row}, column {column}"
 
 
-def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str:
+def choose_variable(file: Path, names: Iterable[str], wanted: str | None) -> str:
     """Returns the name of the wanted variable in a file, or of its only variable."""
-    known = ", ".join(sorted(names)) or "none"
+    names = sorted(names)
+    known = ", ".join(names) or "none"
     if wanted is not None and wanted not in names:
         raise invalid("--variable", f"a variable of {file} ({known})", f"'{wanted}'")
     if wanted is None and len(names) != 1:

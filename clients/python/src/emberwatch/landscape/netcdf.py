@@ -1,6 +1,5 @@
 """Reader of NetCDF files. xarray unpacks numbers and dates; CF attributes state axes and grid."""
 
-import warnings
 from argparse import Namespace
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.common.paths import utf8
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.layers import SINCE_1970, Layer, choose_bands, choose_variable
 from emberwatch.landscape.libraries import library
@@ -27,21 +26,13 @@ def read(file: Path, flags: Namespace) -> Generator[Layer]:
     xarray, path = library("xarray"), utf8("file", file.absolute())
     library("rioxarray")  # adds `rio` to arrays
     options = {"engine": "netcdf4", "decode_coords": "all", "decode_timedelta": False}
-    with warnings.catch_warnings(action="ignore"):
-        try:
-            with xarray.open_dataset(path, cache=False, **options) as dataset:
-                arrays = {
-                    str(name): array
-                    for name, array in dataset.data_vars.items()
-                    if array.ndim > 1 and array.dtype.kind in "biufM"
-                }
-                name = choose_variable(file, list(arrays), flags.variable)
-                yield from _layers(file, arrays[name], flags)
-        except InvalidArgumentError:
-            raise
-        except Exception as error:  # netCDF4, xarray and pyproj raise different errors
-            words = getattr(error, "strerror", None) or error
-            raise InvalidArgumentError(f"{file}: expected a NetCDF file, got: {words}") from None
+    with xarray.open_dataset(path, cache=False, **options) as dataset:
+        arrays = {
+            str(name): array
+            for name, array in dataset.data_vars.items()
+            if array.ndim > 1 and array.dtype.kind in "biufM"
+        }
+        yield from _layers(file, arrays[choose_variable(file, arrays, flags.variable)], flags)
 
 
 def _layers(file: Path, array: Any, flags: Namespace) -> Iterator[Layer]:

@@ -1,6 +1,5 @@
 """Reader of GeoTIFF and ESRI ASCII grids, which uses GDAL through rasterio."""
 
-import warnings
 from argparse import Namespace
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from emberwatch.common.paths import utf8
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.landscape.grid import LIKE, Place
 from emberwatch.landscape.layers import Layer, choose_bands
 from emberwatch.landscape.libraries import library
@@ -17,31 +16,22 @@ from emberwatch.landscape.libraries import library
 
 def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields the bands of a file, which is closed after the last one."""
-    is_ascii = file.suffix.lower() == ".asc"
-    driver, kind = ("AAIGrid", "an ESRI ASCII grid") if is_ascii else ("GTiff", "a GeoTIFF")
-    rasterio, path = library("rasterio"), utf8("file", file.absolute())
-    # GDAL warns about files without a position, which are valid; its other warnings do not help
-    # users.
-    with warnings.catch_warnings(action="ignore"):
-        try:
-            with rasterio.open(path, driver=driver) as source:
-                place = _place(file, source)
-                for band in _bands(file, source, flags):
-                    # GDAL masks cells by numbers that mean "no value", masks and alpha bands.
-                    read = source.read(band, masked=True)
-                    values = read.astype(np.promote_types(read.dtype, np.float32)).filled(np.nan)
-                    values = values * source.scales[band - 1] + source.offsets[band - 1]
-                    yield Layer(
-                        name=f"{file}, band {band}" if source.count > 1 else str(file),
-                        values=_turned(values, source.transform),
-                        place=place,
-                        unit=source.units[band - 1] or "",
-                    )
-        except InvalidArgumentError:
-            raise
-        except Exception as error:  # rasterio's errors have no common base class
-            words = error.__cause__ or error
-            raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
+    path, driver = utf8("file", file.absolute()), "GTiff"
+    if file.suffix.lower() == ".asc":
+        driver = "AAIGrid"
+    with library("rasterio").open(path, driver=driver) as source:
+        place = _place(file, source)
+        for band in _bands(file, source, flags):
+            # GDAL masks cells by numbers that mean "no value", masks and alpha bands.
+            read = source.read(band, masked=True)
+            values = read.astype(np.promote_types(read.dtype, np.float32)).filled(np.nan)
+            values = values * source.scales[band - 1] + source.offsets[band - 1]
+            yield Layer(
+                name=f"{file}, band {band}" if source.count > 1 else str(file),
+                values=_turned(values, source.transform),
+                place=place,
+                unit=source.units[band - 1] or "",
+            )
 
 
 def _bands(file: Path, source: Any, flags: Namespace) -> Sequence[int]:
