@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from typing import Any, Final, TextIO
 
 import gymnasium
@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from emberwatch.benchmark.policies import Actor, Policy
-from emberwatch.benchmark.rows import Row, new_file, write
+from emberwatch.benchmark.rows import Row, new_rows
 from emberwatch.benchmark.tally import Tally
 from emberwatch.client.client import Client
 from emberwatch.client.wire import TRUTH_BUFFER
@@ -103,9 +103,8 @@ def evaluate(
     }
     if keywords.get("instance") is not None:
         batch = min(batch, TRUTH_BUFFER)
-    rows: list[Row] = []
     begin = time.monotonic()
-    with nullcontext() if csv is None else new_file(csv) as file:
+    with new_rows(csv) as rows:
         for first in range(0, len(chosen), batch):
             part = chosen[first : first + batch]
             with _made(env, keywords, len(part) * n_robots, wrap) as (worlds, shown):
@@ -114,8 +113,6 @@ def evaluate(
             if progress is not None:
                 line = f"{name}: {len(rows)} of {len(chosen)} worlds"
                 print(f"{line}, {time.monotonic() - begin:.0f} s", file=progress, flush=True)
-        if file is not None:
-            write(rows, file)
     return rows
 
 

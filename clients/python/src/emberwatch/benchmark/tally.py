@@ -21,9 +21,8 @@ class Tally:
         self._spec: Final = spec
         target = 0 if spec.described is None else spec.described.target_state
         self._merit = _native.MeritTally(n_worlds, spec.height, spec.width, target)
-        self._reward = np.zeros(n_worlds)
-        counts = np.zeros((4, n_worlds), np.int64)
-        self._n_visited, self._n_visits, self._n_hits, self._n_fire = counts
+        #: Rewards, distinct visited cells, visits, hits, and cells in the state that pays most.
+        self._sums = np.zeros((5, n_worlds))
         #: Seconds that the policy took for all actions.
         self.seconds = 0.0
 
@@ -36,11 +35,9 @@ class Tally:
         """Adds a step of all robots; `truths`: hidden states of their worlds, if known."""
         n_robots, robots = self._spec.n_robots, results["robot"]
         worlds = results["world"][::n_robots]
-        self._reward += worlds["reward"]
-        self._n_visited += worlds["n_visited"]
-        self._n_visits += robots["n_visited"].reshape(-1, n_robots).sum(1, np.int64)
-        self._n_hits += worlds["n_hits"]
-        self._n_fire += worlds["n_target_cells"]
+        n_visits = robots["n_visited"].reshape(-1, n_robots).sum(1)
+        counts = (worlds[name] for name in ("n_hits", "n_target_cells"))
+        self._sums += [worlds["reward"], worlds["n_visited"], n_visits, *counts]
         visited = np.zeros((len(worlds), self._spec.height, self._spec.width), np.bool_)
         cells = fly(np.stack((robots["start_row"], robots["start_col"]), 1), paths, self._spec)
         rows = np.arange(len(robots))[:, np.newaxis]
@@ -55,18 +52,19 @@ class Tally:
 
     def row(self, world: int, **columns: Any) -> Row:
         """Returns the row of a world; `columns`: values that do not depend on its steps."""
-        steps, n_visited = columns["steps"], int(self._n_visited[world])
+        steps = columns["steps"]
+        reward, n_visited, n_visits, n_hits, n_fire = self._sums[:, world].tolist()
         detected, n_burning, seen, distance, grid_seen = self._merit.merit(world)
         return Row(
             **columns,
-            mean_reward=float(self._reward[world]) / steps,
+            mean_reward=reward / steps,
             mean_distinct_cells=n_visited / steps,
-            hit_rate=int(self._n_hits[world]) / max(n_visited, 1),
-            mean_fire_cells=int(self._n_fire[world]) / steps,
-            mean_plan_millis=1e3 * self.seconds / steps / len(self._reward),
+            hit_rate=n_hits / max(n_visited, 1),
+            mean_fire_cells=n_fire / steps,
+            mean_plan_millis=1e3 * self.seconds / steps / self._sums.shape[1],
             brier="",
             moves=self._spec.n_moves,
-            mean_repeated=1.0 - n_visited / int(self._n_visits[world]),
+            mean_repeated=1.0 - n_visited / n_visits,
             steps_to_detection=detected,
             burning_cells_at_detection=n_burning,
             burning_seen_share=seen,

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.landscape.grid import check_same, check_square, resampled, target_shape
 from emberwatch.landscape.layers import Layer, where
 from emberwatch.landscape.times import SECONDS, date, schedule, steps_at, unit_of
@@ -35,12 +35,9 @@ class Times(NamedTuple):
     arrival: NDArray[np.float64]
     burnt: NDArray[np.float64]
     n_steps: int
-    name: str
-    """Name of the first layer, for errors."""
-    begin: str | None
-    """The date of step 0, if the files have it."""
-    notes: tuple[str, ...]
-    """What was assumed about the input."""
+    name: str  # of the first layer
+    begin: str | None  # the date of step 0
+    notes: tuple[str, ...]  # what was assumed
 
 
 def times(layers: Iterable[Layer], flags: Namespace) -> Times:
@@ -136,7 +133,10 @@ def _of_stack(layers: Iterable[Layer], flags: Namespace) -> Times:
             now = _coded(layer, flags)
         else:
             now, mark = _marked(layer, flags, state, mark)
-        _check_order(layer, state, now)
+        again = now < state
+        if again.any():
+            got = f"{again.sum()} that burn or are unburnt again, the first {where(again)}"
+            raise invalid(layer.name, "cells that burn once and stay burnt", got)
         state = now
         arrival[(state >= BURNING) & np.isinf(arrival)] = k
         burnt[(state == BURNT) & np.isinf(burnt)] = k
@@ -174,7 +174,6 @@ def _on_world(
 
 
 def _coded(layer: Layer, flags: Namespace) -> NDArray[np.uint8]:
-    """Returns the states that codes mean."""
     now = np.full(layer.values.shape, len(flags.codes), np.uint8)
     for state, code in enumerate(flags.codes):
         now[layer.values == code] = state
@@ -188,7 +187,7 @@ def _coded(layer: Layer, flags: Namespace) -> NDArray[np.uint8]:
 def _marked(
     layer: Layer, flags: Namespace, before: NDArray[np.uint8], mark: float
 ) -> tuple[NDArray[np.uint8], float]:
-    """Returns the states that a mask means, and the number that marks its cells."""
+    """Returns the states, and the number that marks cells."""
     burning = layer.values != 0
     if math.isnan(mark) and burning.any():
         mark = float(layer.values[burning][0])
@@ -201,18 +200,6 @@ def _marked(
     if flags.kind == "burning":
         now[~burning & (before >= BURNING)] = BURNT
     return now, mark
-
-
-def _check_order(layer: Layer, before: NDArray[np.uint8], now: NDArray[np.uint8]) -> None:
-    """Refuses a cell whose state cannot follow its state in the previous layer."""
-    for state, words in (
-        (BURNING, "burnt cells to stay burnt, got {} that burn again"),
-        (UNBURNT, "burning cells not to become unburnt, got {} that are unburnt again"),
-    ):
-        wrong = (now == state) & (before > state)
-        if wrong.any():
-            words = words.format(wrong.sum())
-            raise InvalidArgumentError(f"{layer.name}: expected {words}, the first {where(wrong)}")
 
 
 def _at(layers: NDArray[np.floating[Any]], steps: NDArray[np.float64]) -> NDArray[np.float64]:

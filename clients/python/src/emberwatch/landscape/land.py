@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES, MAX_SIDE
+from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES
 from emberwatch.common.output import Parser, number
 from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.elevation import UNITS, slopes
 from emberwatch.landscape.flags import METRES, add_common
-from emberwatch.landscape.grid import check_same
+from emberwatch.landscape.grid import check_same, target_shape
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Layer, check_full
 from emberwatch.landscape.terrain import model_text, slope_and_wind
@@ -129,12 +129,8 @@ def _layer(file: Path, flags: argparse.Namespace) -> Layer:
         found = list(islice(layers, 2))
     if len(found) != 1:
         raise invalid(file, "one layer", "several; choose with --band")
-    (layer,) = found
-    height, width = layer.place.shape
-    if max(height, width) > MAX_SIDE:
-        most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum"
-        raise invalid(layer.name, most, f"{height} x {width}")
-    return layer
+    target_shape(found[0].place, height=None, cell=None)  # refuses too many cells
+    return found[0]
 
 
 def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:

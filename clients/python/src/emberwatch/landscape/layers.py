@@ -20,18 +20,15 @@ class Layer:
     """One raster."""
 
     name: str
-    """File and band, for errors."""
     values: NDArray[np.floating]
     """Shape (rows, columns), the first row in the north; NaN in cells without a value."""
     place: Place
     unit: str = ""
     """The unit of the values, as the file writes it, or `SINCE_1970`."""
     time: float | None = None
-    """The time of the layer, if the file states it."""
     time_unit: str = ""
-    """The unit of `time`, as the file writes it, or `SINCE_1970`."""
-    notes: tuple[str, ...] = ()
-    """What the reader assumed."""
+    """The unit of `time`, like `unit`."""
+    notes: tuple[str, ...] = ()  # what the reader assumed
 
 
 def check_full(layer: Layer, expected: str, remedy: str) -> None:

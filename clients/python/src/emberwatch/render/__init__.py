@@ -111,7 +111,7 @@ def _panels(picture: Picture, scale: int) -> list[NDArray[np.uint8]]:
         panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
     if no_fly is not None:
         for panel in panels:
-            _draw_hatches(panel, no_fly, scale)
+            draw_hatches(panel, no_fly, scale)
     if scale >= _LEAST_LINE_SCALE:
         seen = (frame != UNOBSERVED)[:, :, np.newaxis]
         ink = np.where(seen, palette.path, mark_on(np.array(palette.unobserved)))
@@ -139,7 +139,8 @@ def _draw_outline(image: NDArray[np.uint8], seen: NDArray[np.bool_], scale: int)
     image[line] = mark_on(image[line])
 
 
-def _draw_hatches(image: NDArray[np.uint8], no_fly: NDArray[np.bool_], scale: int) -> None:
+def draw_hatches(image: NDArray[np.uint8], no_fly: NDArray[np.bool_], scale: int) -> None:
+    """Draws lines over the no-fly cells of an image whose cells have `scale` pixels."""
     rows, cols = np.ogrid[: image.shape[0], : image.shape[1]]
     period = min(max(scale, _LEAST_HATCH), _MOST_HATCH)
     lines = _enlarge(no_fly, scale) & (np.remainder(rows + cols, period) < max(1, period // 4))
