@@ -37,17 +37,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     written `./land`.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments[:1] == ["land"]:
-        return land.main(arguments[1:])
-    parser = _parser()
-    flags = parser.parse_args(arguments)
+    is_land = arguments[:1] == ["land"]
+    parser = land.parser() if is_land else _parser()
+    flags = parser.parse_args(arguments[is_land:])
     try:
-        _import(flags)
+        flags.act(flags)
     except (EmberwatchError, OSError) as error:
         parser.error(str(error))
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> Parser:
     parser = Parser(
         prog="python -m emberwatch.landscape",
         description="Make a recorded world for `emberwatch-server --states` from rasters, "
@@ -77,6 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--cell", type=METRES, metavar="METRES", help="side of the world's cells on the ground")
     add("--time-column", metavar="NAME", help="column with the times of perimeters")
     add_common(parser)
+    parser.set_defaults(act=_import)
     return parser
 
 

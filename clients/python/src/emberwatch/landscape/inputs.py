@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.landscape import netcdf, numpy_file, perimeters, raster
+from emberwatch.landscape import netcdf, perimeters, raster
 from emberwatch.landscape.layers import Layer
 
 #: The reader of each ending, and what it expects.
@@ -20,8 +20,8 @@ _READERS: Final = {
     ".tiff": (raster.read, "a GeoTIFF"),
     ".asc": (raster.read, "an ESRI ASCII grid"),
     ".nc": (netcdf.read, "a NetCDF file"),
-    ".npy": (numpy_file.read, "a NumPy file"),
-    ".npz": (numpy_file.read, "a NumPy file"),
+    ".npy": (raster.read_numpy, "a NumPy file"),
+    ".npz": (raster.read_numpy, "a NumPy file"),
     ".geojson": (perimeters.read, "perimeters"),
     ".gpkg": (perimeters.read, "perimeters"),
     ".shp": (perimeters.read, "perimeters"),

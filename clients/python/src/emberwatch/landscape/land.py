@@ -2,7 +2,6 @@
 
 import argparse
 import io
-from collections.abc import Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -14,13 +13,12 @@ from numpy.typing import NDArray
 from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES
 from emberwatch.common.output import Parser, number
 from emberwatch.common.paths import shown, utf8
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
-from emberwatch.landscape.elevation import UNITS, slopes
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.flags import METRES, add_common
 from emberwatch.landscape.grid import check_same, target_shape
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Layer, check_full
-from emberwatch.landscape.terrain import model_text, slope_and_wind
+from emberwatch.landscape.terrain import UNITS, model_text, slope_and_wind, slopes
 from emberwatch.landscape.world import check_new
 
 _NAME: Final = "python -m emberwatch.landscape land"
@@ -28,22 +26,13 @@ _MOST_FACTOR: Final = 1e6  # maximum factor of a map
 _POINTS: Final = tuple("N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW".split())
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Makes the model file that the flags describe; exits with code 2 and a message on an error."""
-    parser = _parser()
-    flags = parser.parse_args(arguments)
-    try:
-        _make(flags)
-    except (EmberwatchError, OSError) as error:
-        parser.error(str(error))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
+def parser() -> Parser:
+    """Returns the parser of the command."""
+    made = Parser(
         prog=_NAME,
         description="Make a model file with maps from rasters. docs/land.md describes the flags.",
     )
-    add = parser.add_argument
+    add = made.add_argument
     add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
     add("--out", type=Path, required=True, metavar="FILE.toml", help="its maps go to FILE.npz")
     add("--cell", type=METRES, metavar="METRES", help="side of a cell without a projection")
@@ -59,12 +48,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--fuel", type=Path, metavar="RASTER", help="whole numbers, each a class of fuel")
     add("--factors", type=_factors, metavar="N=X,N=X", help="factors of the hazard of classes [1]")
     add("--no-fly", type=Path, metavar="RASTER", help="a number above 0 is a no-fly cell")
-    add_common(parser)
-    parser.set_defaults(kind=None)
-    return parser
+    add_common(made)
+    made.set_defaults(kind=None, act=make)
+    return made
 
 
-def _make(flags: argparse.Namespace) -> None:
+def make(flags: argparse.Namespace) -> None:
+    """Makes the model file that the flags describe."""
     _check_flags(flags)
     out: Path = flags.out
     maps_file, no_fly_file = out.with_suffix(".npz"), out.with_suffix(".no_fly.npy")
