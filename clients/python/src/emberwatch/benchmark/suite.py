@@ -43,7 +43,7 @@ def suite(
     """
     if worlds is not None:
         as_count(worlds, "worlds", 1, 2**32 - 1)
-    policies = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else {}
+    policies = cast("Mapping[str, Any]", policy if isinstance(policy, Mapping) else {})
     sources = list(policies or built_in_tasks() if tasks is None else tasks)
     chosen = [(absolute(source), Task.named(source)) for source in sources]
     for _, task in chosen:

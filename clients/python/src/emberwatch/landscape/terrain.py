@@ -4,6 +4,7 @@ Alexandridis, Vakalis, Siettos and Bafas (2008), "A cellular automata model for 
 prediction", Applied Mathematics and Computation 204, 191-201, doi 10.1016/j.amc.2008.06.046.
 """
 
+import re
 from collections.abc import Sequence
 from typing import Final
 
@@ -14,6 +15,7 @@ from emberwatch.errors import invalid
 from emberwatch.landscape.grid import check_square
 from emberwatch.landscape.layers import Layer, check_full
 from emberwatch.landscape.world import quoted
+from emberwatch.model import Model
 
 UNITS: Final = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 """The length of each unit of heights in metres."""
@@ -24,38 +26,8 @@ _HEIGHTS: Final = (-1000.0, 10_000.0)  # metres: all land, but not the no-data v
 _LIKE: Final = 0.02  # relative tolerance between --cell and the raster's own cell size
 _A: Final = 0.078  # coefficient of slope, per degree
 _C1, _C2 = 0.045, 0.131  # coefficients of wind, per m/s
-_STATES: Final = """
-states = [
-    { name = "unburnt", color = "#2e8b57", initial = 0.99, observed_as = [0.98, 0.01, 0.01] },
-    { name = "burning", color = "#c8371b", initial = 0.01, reward = 1.0, observed_as = [0.01, 0.98, 0.01] },
-    { name = "burnt", color = "#4a4a4a", initial = 0.0, observed_as = [0.05, 0.01, 0.94] },
-]
-observations = [
-    { name = "unburnt", color = "#2e8b57" },
-    { name = "burning", color = "#c8371b" },
-    { name = "burnt", color = "#4a4a4a" },
-]
-
-# Lightning, and the probability with which one burning neighbour ignites the cell on level ground without wind.
-[[transitions]]
-from = "unburnt"
-to = "burning"
-base = 0.000037
-near.burning = [[0.0295, 0.037, 0.0295], [0.037, 0.0, 0.037], [0.0295, 0.037, 0.0295]]
-"""  # noqa: E501
-_BURNT: Final = """
-# A cell burns for 25 steps on average.
-[[transitions]]
-from = "burning"
-to = "burnt"
-base = 0.04
-
-# Regrowth takes 333 steps.
-[[transitions]]
-from = "burnt"
-to = "unburnt"
-base = 0.003
-"""
+#: Probabilities of spread from the neighbours on level ground without wind.
+_NEAR: Final = "[[0.0295, 0.037, 0.0295], [0.037, 0.0, 0.037], [0.0295, 0.037, 0.0295]]"
 
 
 def slopes(
@@ -95,10 +67,13 @@ def slope_and_wind(rise: NDArray[np.float64], speed: float, towards: float) -> N
 
 
 def model_text(name: str, files: dict[str, str], maps: Sequence[str]) -> str:
-    """Returns the text of a model file. `files`: the names of its files of maps, by key."""
+    """Returns the text of `wildfire-burnout` without its wind, and with files of maps, by key."""
     keys = [f"{key} = {quoted(value)}\n" for key, value in {"name": name, **files}.items()]
-    times = f"times = [{', '.join(map(quoted, maps))}]\n" if maps else ""
-    return "".join(keys) + _STATES + times + _BURNT
+    times = f"\ntimes = [{', '.join(map(quoted, maps))}]" if maps else ""
+    _, states, rest = Model.named("wildfire-burnout").toml.partition("\nstates = [")
+    rest = rest.replace(". Wind blows from the left.", " on level ground without wind.")
+    before, near, after = re.split("(?m)^(near.burning = ).*", rest)
+    return f"{''.join(keys)}{states}{before}{near}{_NEAR}{times}{after}"
 
 
 def _sides(layer: Layer, cell: float | None, *, oblong: bool) -> tuple[float, float]:
