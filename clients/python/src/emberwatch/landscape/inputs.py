@@ -74,6 +74,8 @@ def read(files: Iterable[Path], flags: Namespace) -> Generator[Layer]:
                     yield layer
         except InvalidArgumentError:
             raise
+        except ImportError as error:
+            raise InvalidArgumentError(f"{error}; pip install emberwatch[landscape]") from None
         except Exception as error:  # the libraries' errors have no common base class
             words = error.__cause__ or getattr(error, "strerror", None) or error
             raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None

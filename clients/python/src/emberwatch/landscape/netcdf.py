@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Generator, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,6 @@ from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.layers import SINCE_1970, Layer, choose_bands, choose_variable
-from emberwatch.landscape.libraries import library
 
 #: Standard names, units and attributes `axis` of coordinates, or names of dimensions, by axis.
 _ROWS: Final = "y projection_y_coordinate latitude degrees_north lat northing".split()
@@ -23,8 +23,8 @@ _EVEN: Final = 0.1  # tolerance for positions, as a share of a cell, as 32-bit n
 
 def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields a layer for each time of a variable. The file is closed after the last layer."""
-    xarray, path = library("xarray"), utf8("file", file.absolute())
-    library("rioxarray")  # adds `rio` to arrays
+    xarray, path = import_module("xarray"), utf8("file", file.absolute())
+    import_module("rioxarray")  # adds `rio` to arrays
     options = {"engine": "netcdf4", "decode_coords": "all", "decode_timedelta": False}
     with xarray.open_dataset(path, cache=False, **options) as dataset:
         arrays = {
@@ -115,7 +115,7 @@ def _line(file: Path, one: Any) -> tuple[float, float]:
 
 def _crs(array: Any, x: Any) -> Any:
     """Returns the projection of the grid mapping; degrees without one refer to WGS 84."""
-    pyproj, crs = library("pyproj"), array.rio.crs
+    pyproj, crs = import_module("pyproj"), array.rio.crs
     if crs is not None:
         return pyproj.CRS.from_wkt(crs.to_wkt())
     is_angle = str(x.attrs.get("units", "")).lower().startswith("degree")

@@ -10,6 +10,7 @@ import math
 from argparse import Namespace
 from collections.abc import Generator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +21,6 @@ from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place
 from emberwatch.landscape.layers import SINCE_1970, Layer, choose_variable
-from emberwatch.landscape.libraries import library
 
 _MARGIN: Final = 0.1  # unburnt land around the fire, as a share of its longer side
 #: The columns of detections, and the ranges of their numbers.
@@ -36,8 +36,8 @@ _DATE: Final = r"\d{4}([-/]?)(?:0[1-9]|1[0-2])\1[0-3]\d(?!\d)"
 
 def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields the arrival times of the perimeters in a file."""
-    pyogrio, path = library("pyogrio"), utf8("file", file.absolute())
-    library("geopandas")
+    pyogrio, path = import_module("pyogrio"), utf8("file", file.absolute())
+    import_module("geopandas")
     names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
     name = choose_variable(file, names, flags.variable)
     table = pyogrio.read_dataframe(path, layer=name, datetime_as_string=True)
@@ -48,7 +48,7 @@ def read(file: Path, flags: Namespace) -> Generator[Layer]:
 
 def read_detections(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields the arrival times of the detections in a file."""
-    geopandas, pandas = library("geopandas"), library("pandas")
+    geopandas, pandas = import_module("geopandas"), import_module("pandas")
     table = pandas.read_csv(file, dtype=str, keep_default_na=False)
     missing = [name for name in _NEEDED if name not in table]
     if missing or not len(table):
@@ -60,13 +60,13 @@ def read_detections(file: Path, flags: Namespace) -> Generator[Layer]:
     points = geopandas.GeoSeries.from_xy(longitude, latitude, crs="EPSG:4326")
     points, east, north = _on_plane(file, points), 500 * scan, 500 * track  # half the sides, metres
     x, y = points.x, points.y
-    footprints = library("shapely").box(x - east, y - north, x + east, y + north)
+    footprints = import_module("shapely").box(x - east, y - north, x + east, y + north)
     yield _drawn(file, geopandas.GeoSeries(footprints, crs=points.crs), seconds, flags)
 
 
 def _seconds_of(subject: str, words: Any, form: str = "ISO8601") -> Any:
     """Parses a column to seconds since 1970; refuses other words, and empty ones, by their row."""
-    pandas = library("pandas")
+    pandas = import_module("pandas")
     times = pandas.to_datetime(words, errors="coerce", format=form, utc=True)
     wrong = np.flatnonzero(times.isna())
     if wrong.size:
@@ -106,11 +106,11 @@ def _drawn(file: Path, shapes: Any, times: Any, flags: Namespace) -> Layer:
         got = f"{height} x {width}; use a larger --cell"
         raise invalid(file, f"perimeters on at most {MAX_SIDE} x {MAX_SIDE} cells", got)
     order = np.argsort(-times, kind="stable")
-    arrival = library("rasterio.features").rasterize(
+    arrival = import_module("rasterio.features").rasterize(
         zip(shapes.iloc[order], times[order], strict=True),
         out_shape=(height, width),
         fill=np.nan,
-        transform=library("rasterio").Affine(side, 0.0, left, 0.0, -side, top),
+        transform=import_module("rasterio").Affine(side, 0.0, left, 0.0, -side, top),
         dtype="float64",
     )
     if not (arrival == times.min()).any():
@@ -154,7 +154,7 @@ def _times(file: Path, columns: Any, wanted: str | None) -> tuple[Any, str, str]
 
 def _numbers(file: Path, table: Any, name: str) -> Any:
     """Returns a column of numbers."""
-    numbers = library("pandas").to_numeric(table[name], errors="coerce").to_numpy()
+    numbers = import_module("pandas").to_numeric(table[name], errors="coerce").to_numpy()
     low, high = _RANGES[name]
     wrong = np.flatnonzero(~((numbers >= low) & (numbers <= high)))
     if wrong.size:

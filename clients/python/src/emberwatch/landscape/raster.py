@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Generator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ from emberwatch.common.paths import utf8
 from emberwatch.errors import invalid
 from emberwatch.landscape.grid import LIKE, Place
 from emberwatch.landscape.layers import Layer, choose_bands, choose_variable
-from emberwatch.landscape.libraries import library
 
 
 def read(file: Path, flags: Namespace) -> Generator[Layer]:
@@ -19,7 +19,7 @@ def read(file: Path, flags: Namespace) -> Generator[Layer]:
     path, driver = utf8("file", file.absolute()), "GTiff"
     if file.suffix.lower() == ".asc":
         driver = "AAIGrid"
-    with library("rasterio").open(path, driver=driver) as source:
+    with import_module("rasterio").open(path, driver=driver) as source:
         place = _place(file, source)
         for band in _bands(file, source, flags):
             # GDAL masks cells by numbers that mean "no value", masks and alpha bands.
@@ -77,7 +77,7 @@ def _place(file: Path, source: Any) -> Place:
         shape=source.shape,
         corner=(min(transform.c, east), max(transform.f, south)),
         cell=(abs(transform.a), abs(transform.e)),
-        crs=library("pyproj").CRS.from_wkt(crs.to_wkt()) if crs else None,
+        crs=import_module("pyproj").CRS.from_wkt(crs.to_wkt()) if crs else None,
     )
 
 
