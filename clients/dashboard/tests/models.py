@@ -1,23 +1,19 @@
-"""Model files with any number of states and observations."""
+"""A model file with any number of states and observations."""
 
 
-def model_file(
-    states: dict[str, tuple[float, float, list[float]]],
-    observations: list[str],
-    weights: list[list[float]],
-    scales: dict[tuple[str, str], float],
-) -> str:
-    """Returns a model file. States have an initial probability, a reward, and observation weights.
-
-    The kernel between two states is `weights` times the pair's scale.
-    """
-    lines = ['name = "made"', f"kernel_size = {[len(weights), len(weights[0])]}"]
-    for number, (name, (initial, reward, observed_as)) in enumerate(states.items()):
-        lines += ["[[states]]", f'name = "{name}"', f'color = "#8080{16 * number:02x}"']
-        lines += [f"initial = {initial}", f"reward = {reward}", f"observed_as = {observed_as}"]
-    for number, name in enumerate(observations):
-        lines += ["[[observations]]", f'name = "{name}"', f'color = "#8080{16 * number:02x}"']
-    for (source, target), scale in scales.items():
-        lines += ["[[kernel]]", f'from = "{source}"', f'to = "{target}"']
-        lines += [f"scale = {scale}", f"weights = {weights}"]
-    return "\n".join(lines)
+def write_model(path, n_states, n_observations):
+    """Writes a model of states that never change, each observed as its own values alone."""
+    lines = ['name = "made"', "kernel_size = [1, 1]"]
+    share = n_observations // n_states
+    for state in range(n_states):
+        seen = [float(value // share == state) / share for value in range(n_observations)]
+        lines += ["[[states]]", f'name = "state-{state}"', f'color = "#8080{16 * state:02x}"']
+        lines += [f"initial = {1 / n_states}", f"reward = {float(state == 0)}"]
+        lines += [f"observed_as = {seen}"]
+    for value in range(n_observations):
+        lines += ["[[observations]]", f'name = "kind {value}"', f'color = "#8080{16 * value:02x}"']
+    for state in range(n_states):
+        lines += ["[[kernel]]", f'from = "state-{state}"', f'to = "state-{state}"']
+        lines += ["scale = 1.0", "weights = [[1.0]]"]
+    path.write_text("\n".join(lines))
+    return path

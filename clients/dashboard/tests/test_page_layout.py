@@ -2,7 +2,7 @@
 
 import pytest
 
-from models import model_file
+from models import write_model
 from teams import write_recording
 
 SIZES = [(360, 740), (768, 1024), (1024, 768), (1056, 640), (1280, 720), (1920, 1080), (2560, 1440)]
@@ -138,8 +138,7 @@ def test_with_a_recording_of_a_team(programs, open_page, tmp_path, n_robots):
 
 
 def test_with_many_states(programs, open_page, tmp_path):
-    model = tmp_path / "model.toml"
-    model.write_text(model_of(9))
+    model = write_model(tmp_path / "model.toml", 9, 9)
     server = programs.server(model=model, publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
     begin(look)
@@ -147,11 +146,3 @@ def test_with_many_states(programs, open_page, tmp_path):
     look.eventually(lambda: look.picture(".agent.is_live") is False, "the last belief")
     look.eventually(lambda: look.text("holder") == "nobody", "the agent is gone")
     check(look)
-
-
-def model_of(n_states: int) -> str:
-    """Returns a model file with states that never change and are observed exactly."""
-    names = [f"state-{state}" for state in range(n_states)]
-    seen = [[float(other == state) for other in range(n_states)] for state in range(n_states)]
-    states = {name: (1 / n_states, float(i == 0), seen[i]) for i, name in enumerate(names)}
-    return model_file(states, names, [[1.0]], {(name, name): 1.0 for name in names})

@@ -45,24 +45,6 @@ def test_a_browser_beyond_the_limit_is_refused_until_another_leaves(watched, ope
     late.eventually(lambda: late.text("state") == "serving", "a place")
 
 
-def settled_serial(look) -> int:
-    """Waits until the page and its slider show the same entry. Returns its serial number."""
-    look.eventually(
-        lambda: (
-            look.at("pause").text_content() != "Pause"
-            and look.number("serial") == look.picture(".shown.serial")
-        ),
-        "paused",
-    )
-    before = None
-    serial = look.picture(".shown.serial")
-    while serial != before:
-        drawn, before = look.drawn(), serial
-        look.eventually(lambda drawn=drawn: look.drawn() > drawn + 1, "two pictures")
-        serial = look.picture(".shown.serial")
-    return serial
-
-
 def test_keys_pause_and_scrub_from_anywhere(watched, programs):
     look = watched.look
     look.eventually(
@@ -70,7 +52,9 @@ def test_keys_pause_and_scrub_from_anywhere(watched, programs):
     )
     watched.agent.interrupt()
     look.page.keyboard.press("Space")
-    at = settled_serial(look)
+    look.eventually(lambda: look.at("pause").text_content() != "Pause", "paused")
+    look.wait_for_pictures()
+    at = look.picture(".shown.serial")
     look.wait_for_pictures()
     assert look.picture(".shown.serial") == at, "pictures while paused"
     for key, by in [("ArrowLeft", -1), ("Shift+ArrowLeft", -10), ("ArrowRight", 1)]:

@@ -33,32 +33,6 @@ def test_damaged_pictures_are_told_and_do_not_flood_the_console(watched):
     assert look.heard("expected 4 bytes") == 1
 
 
-def test_losses_move_nothing(watched):
-    look = watched.look
-    watched.agent.interrupt()
-    lost: dict[str, int] = {}
-    first: dict[str, object] = {}
-
-    # A fact that grows, such as "silent", can wrap its line, so all facts but the losses are fixed.
-    def hold(words: dict) -> None:
-        for name in words.keys() - {"arrays", "series"}:
-            words[name] = first.setdefault(name, words[name])
-        words["lost"] = lost
-
-    look.alter(lambda message: told_again(message, hold))
-
-    def place_with(frames: int, others: int) -> dict[str, float]:
-        lost.update(frames=frames, truth=others, agent=others)
-        shown = f"{frames:,}"
-        look.eventually(lambda: look.text("lost") == shown, "the frames lost")
-        look.wait_for_pictures()
-        return look.at("chart-reward").bounding_box()
-
-    for width in (1056, 1280, 1600):
-        look.page.set_viewport_size({"width": width, "height": 720})
-        assert place_with(0, 0) == place_with(1_234_567, 72_141), width
-
-
 def test_what_is_lost_or_not_known_is_told(watched):
     look = watched.look
     watched.agent.interrupt()

@@ -35,59 +35,20 @@ def model(*, radius: int = 0, no_fly: Cells | str | None = None) -> str:
     return text.replace("kernel_size = [3, 3]\n", "kernel_size = [3, 3]\n" + "\n".join(keys) + "\n")
 
 
-#: A model of hazards on a 7 x 5 grid, whose maps are in `land.npz`.
-HAZARDS = """
-name = "land"
-maps = "land.npz"
-states = [
-    { name = "green", color = "#000000", initial = 0.8, observed_as = [0.9, 0.05, 0.05] },
-    { name = "fire", color = "#111111", initial = 0.2, reward = 1, observed_as = [0.1, 0.8, 0.1] },
-    { name = "ash", color = "#222222", initial = 0.0, observed_as = [0.05, 0.05, 0.9] },
-]
-observations = [
-    { name = "green", color = "#000000" },
-    { name = "fire", color = "#111111" },
-    { name = "ash", color = "#222222" },
-]
-
-[[transitions]]
-from = "green"
-to = "fire"
-base = 0.01
-near.fire = [[0.1, 0.3, 0.1], [0.3, 0.0, 0.2], [0.1, 0.3, 0.1]]
-times = ["fuel", "wind"]
-
-[[transitions]]
-from = "green"
-to = "ash"
-base = 0.02
-near.ash = [[0.05], [0.0], [0.1]]
-
-[[transitions]]
-from = "fire"
-to = "ash"
-base = 0.2
-
-[[transitions]]
-from = "ash"
-to = "green"
-base = 0.1
-"""
-
-
 def maps(key: int) -> dict[str, NDArray[np.float32]]:
-    """Returns random maps for `HAZARDS`. Cells of the first column never burn."""
+    """Returns random maps of a 7 x 5 grid."""
     rng = np.random.default_rng(key)
     fuel = rng.uniform(0.5, 2.0, (7, 5))
-    fuel[:, 0] = 0.0
     wind = rng.uniform(0.0, 3.0, (3, 3, 7, 5))
     return {"fuel": fuel.astype(np.float32), "wind": wind.astype(np.float32)}
 
 
 def write_hazards(folder: Path, key: int) -> Path:
-    """Writes the model and its maps. Returns the path of the model."""
+    """Writes a model of hazards with `maps(key)`. Returns its path."""
+    text = (Path(LIVELY).parents[3] / "config/models/wildfire-burnout.toml").read_text()
+    text = text.replace("states = [", 'maps = "land.npz"\nstates = [', 1)
     path = folder / "hazards.toml"
-    path.write_text(HAZARDS)
+    path.write_text(text.replace("near.", 'times = ["fuel", "wind"]\nnear.', 1))
     np.savez(folder / "land.npz", **maps(key))  # pyright: ignore
     return path
 

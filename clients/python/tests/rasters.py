@@ -77,6 +77,14 @@ def geotiff(
     return path
 
 
+def changed(file: Path, **properties: object) -> Path:
+    """Sets properties of a GeoTIFF."""
+    with rasterio.open(file, "r+") as opened:
+        for name, value in properties.items():
+            setattr(opened, name, value)
+    return file
+
+
 def ascii_grid(path: Path, values: NDArray[Any] = ARRIVAL, *, side: str = "cellsize 30") -> Path:
     rows = [" ".join(str(value) for value in row) for row in values.tolist()]
     head = f"ncols {values.shape[1]}\nnrows {len(values)}\nxllcorner 0\nyllcorner 0\n{side}\n"

@@ -1,7 +1,6 @@
 """The files that `evaluate` and `suite` write: whole and new."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +20,6 @@ def go(csv: object, name: str = "mine", policy: Any = None, **changes: Any) -> l
 
 def up(frames: Any) -> Any:
     return np.zeros(len(frames), int)
-
-
-def after(n_calls: int, call: Callable[[], object]) -> Callable[[Any], Any]:
-    """Returns a policy like `up` that once calls a function; 20 calls are a world."""
-    calls = iter(range(1000))
-
-    def act(frames: Any) -> Any:
-        if next(calls) == n_calls:
-            call()
-        return up(frames)
-
-    return act
 
 
 def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -61,22 +48,19 @@ def test_an_evaluation_that_ends_early_leaves_no_file(
 ) -> None:
     monkeypatch.chdir(tmp_path)
 
-    def stop() -> None:
+    def stop(_: Any) -> None:
         os.chdir("/")
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        go("mine.csv", policy=after(10, stop))
+        go("mine.csv", policy=stop)
     assert not list(tmp_path.iterdir())
 
 
 def test_unwritable_files_are_refused_before_the_policy_acts(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
     for csv, problem in (
         ("/proc/rows.csv", "^csv: expected a file that can be written, got /proc/rows.csv: "),
-        (tmp_path / "file/rows.csv", "^csv: .*file already exists"),
         (tmp_path, "^csv: .* already exists"),
-        ("a\x00b", "^csv: expected UTF-8"),
         (7, "^csv: expected text or a path"),
     ):
         with refuses(problem):
@@ -91,17 +75,7 @@ def test_a_suite_writes_a_file_for_each_task(tmp_path: Path) -> None:
     assert [(row.world_seed, row.steps) for row in rows["small"]] == [(0, 300)]
     with refuses("csv: .*small/my_rule.csv already exists"):
         suite(up, **options)
-
-
-@pytest.mark.parametrize(
-    ("changes", "problem"),
-    [
-        ({"tasks": ["ash"]}, "task ash: No such file"),
-        ({"worlds": 0}, "worlds: expected an integer within 1 to 4294967295, got 0"),
-        ({"policy": {"team": up}}, "policy: expected one for the task small, got ..team"),
-    ],
-)
-def test_a_suite_is_refused_before_it_runs(tmp_path: Path, changes: Any, problem: str) -> None:
-    chosen = {"policy": up, "name": "mine", "tasks": ["small"], "folder": tmp_path} | changes
-    with refuses(problem):
-        suite(**chosen)
+    with refuses("policy: expected one for the task small, got ..team"):
+        suite({"team": up}, **options)
+    with refuses("worlds: expected an integer within 1 to 4294967295, got 0"):
+        suite(up, **options | {"worlds": 0})

@@ -3,12 +3,28 @@
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
+import xarray
 from numpy.typing import NDArray
-from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf, world, worlds
+from pyproj import CRS
+from rasters import (
+    ARRIVAL,
+    NEVER,
+    UTM,
+    X,
+    Y,
+    ascii_grid,
+    changed,
+    geotiff,
+    masks,
+    netcdf,
+    world,
+    worlds,
+)
 
 from emberwatch.landscape.__main__ import main
 from emberwatch.landscape.inputs import stacks
@@ -23,13 +39,6 @@ STATES = ("--kind", "states", *STEP)
 BEGIN = np.where(ARRIVAL == NEVER, 99, np.ceil(ARRIVAL / 10))
 #: The states of all six steps, in which a cell burns for two steps.
 FIRE = np.array([(BEGIN <= k) + (BEGIN + 2 <= k).astype(int) for k in range(6)], np.uint8)
-
-
-def changed(file: Path, **properties: object) -> Path:
-    with rasterio.open(file, "r+") as opened:
-        for name, value in properties.items():
-            setattr(opened, name, value)
-    return file
 
 
 def with_never(value: float, scale: float = 1) -> NDArray[np.float64]:
@@ -242,3 +251,41 @@ def test_the_shipped_landscape_is_imported_again(tmp_path: Path) -> None:
             worlds(*names, *STATES, "--cell", 360), file.items(), strict=True
         ):
             np.testing.assert_array_equal(got, states[::100], name)
+
+
+METRES, EAST, NORTH = {"units": "m"}, {"units": "degrees_east"}, {"units": "degrees_north"}
+#: Variables and coordinates of one NetCDF fire, whose rows run from the north unless told.
+LAYOUTS: dict[str, tuple[tuple[str, str], Any, dict[str, Any]]] = {
+    "no coordinates, from the south": (("y", "x"), ARRIVAL[::-1], {}),
+    "columns before rows": (("x", "y"), ARRIVAL.T, {"y": ("y", Y, METRES), "x": ("x", X, METRES)}),
+    "columns before rows by units": (
+        ("a", "b"), ARRIVAL.T,
+        {"a": ("a", np.arange(4.0), EAST), "b": ("b", 2 - np.arange(3.0), NORTH)},
+    ),
+    "rising rows and falling columns": (
+        ("y", "x"), ARRIVAL[::-1, ::-1],
+        {"y": ("y", Y[::-1], METRES), "x": ("x", X[::-1], METRES)},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_axes_of_netcdf_files_are_recognized(name: str, tmp_path: Path) -> None:
+    over, values, coordinates = LAYOUTS[name]
+    file = tmp_path / "a.nc"
+    values = np.where(values == NEVER, np.nan, values)
+    xarray.Dataset({"v": (over, values, {"units": "min"})}, coordinates).to_netcdf(file)
+    np.testing.assert_array_equal(world(file, *ARRIVALS, "--oblong"), FIRE)
+
+
+def test_netcdf_files_in_kilometres_or_with_a_grid_mapping_are_on_one_grid(tmp_path: Path) -> None:
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    crs = ((), 0, {"crs_wkt": CRS(UTM).to_wkt()})
+    for k, (size, unit) in enumerate(((1, "m"), (1000, "km"))):
+        axes = {"y": ("y", Y / size, {"units": unit}), "x": ("x", X / size, {"units": unit})}
+        time = ((), [7.0, 10.0][k], {"units": "minutes since 2020-08-01"})
+        mask = {"v": (("y", "x"), FIRE[2 * k], {"grid_mapping": "crs"})}
+        xarray.Dataset(mask, axes | {"crs": crs, "time": time}).to_netcdf(folder / f"{k}.nc")
+    states = world(folder, "--kind=states", "--step=1 min", "--cell=30")
+    assert [len(states), *states[:, 1, 1]] == [4, 0, 0, 0, 1]

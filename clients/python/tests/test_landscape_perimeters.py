@@ -115,6 +115,7 @@ REFUSED: list[tuple[str, list[Any], dict[str, Any]]] = [
     ("expected degrees in a zone of UTM, got coordinates of [499700.0, 3999700.0", SQUARES,
         {"crs": "EPSG:4326"}),
     ("fire.gpkg: expected perimeters, got:", [], {}),
+    ("expected --kind arrival and --cell METRES, the side of the cells to draw", SQUARES, {}),
 ]  # fmt: skip
 
 
@@ -127,20 +128,12 @@ def test_other_perimeters_are_refused(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    file = tmp_path / "fire.gpkg"
+    file, flags = tmp_path / "fire.gpkg", FLAGS[:3] if "and --cell METRES" in words else FLAGS
     if shapes:
         perimeters(file, shapes, **columns)
     else:
         file.write_text("hello")
-    assert words in refused(capsys, file, *FLAGS, "--out", tmp_path / "world.npz")
-
-
-def test_perimeters_need_a_size_of_cells(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = perimeters(tmp_path / "a.gpkg", SQUARES)
-    words = "expected --kind arrival and --cell METRES, the side of the cells to draw polygons on"
-    assert words in refused(capsys, file, *FLAGS[:3], "--out", tmp_path / "world.npz")
+    assert words in refused(capsys, file, *flags, "--out", tmp_path / "world.npz")
 
 
 HEAD = "latitude,longitude,scan,track,acq_date,acq_time,instrument,confidence\n"

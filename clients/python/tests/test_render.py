@@ -80,11 +80,8 @@ def test_the_truth_is_drawn_to_the_right_or_below() -> None:
 
 def test_panels_are_about_512_pixels_with_even_sides() -> None:
     for grid, panel, both in (
-        ((64, 64), (512, 512), (512, 1032)),
         ((7, 5), (518, 370), (518, 748)),
-        ((128, 40), (512, 160), (512, 328)),
         ((40, 128), (160, 512), (328, 512)),
-        ((1, 1), (512, 512), (512, 1032)),
         ((600, 601), (600, 602), (600, 1210)),
     ):
         parts = {"frame": np.full(grid, 255, np.uint8), "robots": [(0, 0)], "paths": []}
@@ -205,10 +202,8 @@ def test_a_missing_screen_is_logged_once(
         screen.show(Picture(**PARTS))
         screen.close()
     assert screen.kind == "nothing" and capsys.readouterr().out == ""
-    assert [record.message for record in caplog.records] == [
-        "render_mode 'human' shows nothing: it needs pygame and a display, or a terminal as "
-        "standard output; use 'rgb_array' or 'ansi' to get pictures"
-    ]
+    (record,) = caplog.records
+    assert "shows nothing: it needs pygame and a display, or a terminal" in record.message
 
 
 def test_pictures_are_limited_to_fps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from typing import Any, Final, TextIO
 
 import gymnasium
@@ -14,15 +14,17 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+import emberwatch._native as _native
 from emberwatch.benchmark.policies import Actor, Policy
-from emberwatch.benchmark.rows import Row, new_file, write
-from emberwatch.benchmark.tally import Tally
+from emberwatch.benchmark.rows import Row, new_rows
 from emberwatch.client.client import Client
 from emberwatch.client.wire import TRUTH_BUFFER
 from emberwatch.common.arguments import as_count, as_list, as_seed
 from emberwatch.common.paths import with_absolute_paths
-from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, names_of
+from emberwatch.envs.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
+from emberwatch.envs.settings import WorldSpec
 from emberwatch.errors import invalid, repr_of
+from emberwatch.model.moves import fly
 from emberwatch.model.tasks import Task
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
@@ -103,9 +105,8 @@ def evaluate(
     }
     if keywords.get("instance") is not None:
         batch = min(batch, TRUTH_BUFFER)
-    rows: list[Row] = []
     begin = time.monotonic()
-    with nullcontext() if csv is None else new_file(csv) as file:
+    with new_rows(csv) as rows:
         for first in range(0, len(chosen), batch):
             part = chosen[first : first + batch]
             with _made(env, keywords, len(part) * n_robots, wrap) as (worlds, shown):
@@ -114,8 +115,6 @@ def evaluate(
             if progress is not None:
                 line = f"{name}: {len(rows)} of {len(chosen)} worlds"
                 print(f"{line}, {time.monotonic() - begin:.0f} s", file=progress, flush=True)
-        if file is not None:
-            write(rows, file)
     return rows
 
 
@@ -159,7 +158,7 @@ def _play(
 ) -> list[Row]:
     """Scores a policy on the worlds of some seeds, all at the same time."""
     steps = columns["steps"]
-    tally = Tally(worlds.world_spec, len(seeds))
+    tally = _Tally(worlds.world_spec, len(seeds))
     seen, _ = shown.reset(seed=np.repeat(seeds, columns["robots"]).tolist())
     fingerprint = worlds.lease.client.info.worlds_fingerprint or ""
     n_actions = 1 if worlds.single_action_space.shape else worlds.world_spec.n_moves
@@ -177,3 +176,62 @@ def _play(
         tally.add(worlds.results, paths, worlds.truths)
     columns = {**columns, "worlds_fingerprint": fingerprint}
     return [tally.row(world, world_seed=seed, **columns) for world, seed in enumerate(seeds)]
+
+
+class _Tally:
+    """Sums of results over the steps of several worlds, one entry for each world."""
+
+    def __init__(self, spec: WorldSpec, n_worlds: int) -> None:
+        self._spec: Final = spec
+        target = 0 if spec.described is None else spec.described.target_state
+        self._merit = _native.MeritTally(n_worlds, spec.height, spec.width, target)
+        #: Rewards, distinct visited cells, visits, hits, and cells in the state that pays most.
+        self._sums = np.zeros((5, n_worlds))
+        #: Seconds that the policy took for all actions.
+        self.seconds = 0.0
+
+    def add(
+        self,
+        results: NDArray[np.void],
+        paths: NDArray[np.integer],
+        truths: NDArray[np.uint8] | None,
+    ) -> None:
+        """Adds a step of all robots; `truths`: hidden states of their worlds, if known."""
+        n_robots, robots = self._spec.n_robots, results["robot"]
+        worlds = results["world"][::n_robots]
+        n_visits = robots["n_visited"].reshape(-1, n_robots).sum(1)
+        counts = (worlds[name] for name in ("n_hits", "n_target_cells"))
+        self._sums += [worlds["reward"], worlds["n_visited"], n_visits, *counts]
+        visited = np.zeros((len(worlds), self._spec.height, self._spec.width), np.bool_)
+        cells = fly(np.stack((robots["start_row"], robots["start_col"]), 1), paths, self._spec)
+        rows = np.arange(len(robots))[:, np.newaxis]
+        visited[rows // n_robots, cells[..., 0], cells[..., 1]] = True
+        self._merit.update(
+            visited,
+            cells_of(robots).reshape(-1, n_robots, 2),
+            worlds["n_hits"].astype(np.uint32),
+            worlds["n_target_cells"].astype(np.uint32),
+            None if truths is None or not self._spec.described else truths[::n_robots],
+        )
+
+    def row(self, world: int, **columns: Any) -> Row:
+        """Returns the row of a world; `columns`: values that do not depend on its steps."""
+        steps = columns["steps"]
+        reward, n_visited, n_visits, n_hits, n_fire = self._sums[:, world].tolist()
+        detected, n_burning, seen, distance, grid_seen = self._merit.merit(world)
+        return Row(
+            **columns,
+            mean_reward=reward / steps,
+            mean_distinct_cells=n_visited / steps,
+            hit_rate=n_hits / max(n_visited, 1),
+            mean_fire_cells=n_fire / steps,
+            mean_plan_millis=1e3 * self.seconds / steps / self._sums.shape[1],
+            brier="",
+            moves=self._spec.n_moves,
+            mean_repeated=1.0 - n_visited / n_visits,
+            steps_to_detection=detected,
+            burning_cells_at_detection=n_burning,
+            burning_seen_share=seen,
+            front_distance=distance,
+            grid_seen_share=grid_seen,
+        )

@@ -1,17 +1,22 @@
-"""Rows of the benchmark, and their CSV files."""
+"""Rows of the benchmark, their CSV files, and their summary."""
 
 from __future__ import annotations
 
 import csv
+import math
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch._native import FIRST_TRAINING_SEED
 from emberwatch.common.paths import utf8
-from emberwatch.errors import ExistingFileError, invalid, shortened
+from emberwatch.errors import ExistingFileError, invalid, repr_of, shortened
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,8 +98,15 @@ def _row(line: dict[Any, Any]) -> Row:
 
 
 @contextmanager
-def new_file(path: str | os.PathLike[str]) -> Generator[TextIO]:
-    """Creates a file and its folder. Removes the file if an exception is raised."""
+def new_rows(path: str | os.PathLike[str] | None) -> Generator[list[Row]]:
+    """Creates a file and its folder, and writes the rows of the list that it yields at the end.
+
+    Removes the file if an exception is raised. Without a path, writes nothing.
+    """
+    rows: list[Row] = []
+    if path is None:
+        yield rows
+        return
     whole = os.path.abspath(utf8("csv", path))
     try:
         os.makedirs(os.path.dirname(whole), exist_ok=True)
@@ -108,14 +120,67 @@ def new_file(path: str | os.PathLike[str]) -> Generator[TextIO]:
         raise invalid("csv", "a file that can be written", got) from None
     try:
         with file:
-            yield file
+            yield rows
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(field.name for field in fields(Row))
+            writer.writerows(astuple(row) for row in rows)
     except BaseException:
         os.unlink(whole)
         raise
 
 
-def write(rows: Iterable[Row], file: TextIO) -> None:
-    """Writes a file of rows."""
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(field.name for field in fields(Row))
-    writer.writerows(astuple(row) for row in rows)
+def summary(rows: Sequence[Row], *, baseline: str | None = None) -> str:
+    """Returns each policy's mean reward per step and its standard error over worlds, in lines.
+
+    Args:
+        rows: The rows of one or several policies.
+        baseline: The name of a policy in `rows`. If given, the line of each other policy also has
+            the mean difference from this policy's rewards, paired by world, with its standard
+            error.
+    """
+    if not rows:
+        raise invalid("rows", "at least one", "none")
+    policies: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        policies.setdefault((row.policy, row.estimator, row.robots, row.team), []).append(row)
+    bases = [each for name, each in policies.items() if name[0] == baseline]
+    if baseline is not None and len(bases) != 1:
+        names = ", ".join(name for name, *_ in policies)
+        raise invalid("baseline", f"the name of one of the policies {names}", repr_of(baseline))
+    lines: list[str] = []
+    for each in policies.values():
+        line = f"{each[0].policy}: {_mean([row.mean_reward for row in each], '.2f')} a step on "
+        line += _worlds([row.world_seed for row in each])
+        for base in bases if bases != [each] else ():
+            line += f"; difference from {baseline}: {_mean(_differences(each, base), '+.2f')}"
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def _differences(rows: Sequence[Row], base: Sequence[Row]) -> list[float]:
+    """Returns how much more a policy found than another one in each world."""
+    rewards, others = (
+        {(row.worlds_fingerprint, row.world_seed, row.steps): row.mean_reward for row in each}
+        for each in (rows, base)
+    )
+    is_known = all(fingerprint for fingerprint, *_ in rewards)
+    is_once = len(rows) == len(rewards) == len(base)
+    if rewards.keys() != others.keys() or not is_once or not is_known:
+        names = f"{rows[0].policy!r} and {base[0].policy!r}"
+        expected = f"the same worlds_fingerprint, seeds and steps of {names}, each world once"
+        raise invalid("rows", expected, "others")
+    return [rewards[world] - others[world] for world in rewards]
+
+
+def _mean(values: list[float], style: str) -> str:
+    """Returns the mean and its standard error, which needs several values."""
+    given: NDArray[np.float64] = np.array(values)
+    error = f" +- {given.std(ddof=1) / math.sqrt(len(values)):.2f}" if len(values) > 1 else ""
+    return f"{given.mean():{style}}{error}"
+
+
+def _worlds(seeds: Sequence[int]) -> str:
+    """Returns the number of worlds in words."""
+    n_test = sum(seed < FIRST_TRAINING_SEED for seed in seeds)
+    sort = "test " if n_test == len(seeds) else "" if n_test == 0 else f"({n_test} test) "
+    return f"{len(seeds)} {sort}{'world' if len(seeds) == 1 else 'worlds'}"

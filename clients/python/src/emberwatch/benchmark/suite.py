@@ -43,12 +43,12 @@ def suite(
     """
     if worlds is not None:
         as_count(worlds, "worlds", 1, 2**32 - 1)
-    policies = cast("Mapping[str, Any]", policy) if isinstance(policy, Mapping) else None
+    policies = cast("Mapping[str, Any]", policy if isinstance(policy, Mapping) else {})
     sources = list(policies or built_in_tasks() if tasks is None else tasks)
     chosen = [(absolute(source), Task.named(source)) for source in sources]
-    lacking = [task.name for _, task in chosen if policies and task.name not in policies]
-    if lacking:
-        raise invalid("policy", f"one for the task {lacking[0]}", list(policies or ()))
+    for _, task in chosen:
+        if policies and task.name not in policies:
+            raise invalid("policy", f"one for the task {task.name}", list(policies))
     folder = Path(folder).absolute()
     return {
         task.name: evaluate(

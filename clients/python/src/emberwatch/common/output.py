@@ -1,6 +1,34 @@
-"""Standard output of the commands `python -m emberwatch...`."""
+"""Flags and standard output of the commands `python -m emberwatch...`."""
 
+import argparse
+import math
 import signal
+from collections.abc import Callable
+from typing import NoReturn
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exits with code 2 and the message."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def number(kind: type[float], least: float, most: float) -> Callable[[str], float]:
+    """Returns a function that parses a flag's number, which must be within `least` to `most`."""
+
+    def parse(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            sort = "a whole number, " if kind is int else ""
+            raise argparse.ArgumentTypeError(f"expected {sort}{least} to {most}, got {text}")
+        return value
+
+    return parse
 
 
 def end_with_reader() -> None:

@@ -1,7 +1,6 @@
 """`python -m emberwatch.landscape`: converts rasters of fires to a recorded world."""
 
 import argparse
-import math
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -12,14 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.common.output import end_with_reader
+from emberwatch.common.output import Parser, end_with_reader, number
 from emberwatch.common.paths import shown
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape import land
-from emberwatch.landscape.fire import BURNING, BURNT, KINDS, UNBURNT, Meaning, states, times
-from emberwatch.landscape.flags import Parser, add_common, metres, whole
+from emberwatch.landscape.fire import BURNING, BURNT, UNBURNT, states, times
+from emberwatch.landscape.flags import METRES, WHOLE, add_common
 from emberwatch.landscape.inputs import read, stacks
-from emberwatch.landscape.layers import Choice
 from emberwatch.landscape.times import length
 from emberwatch.landscape.world import check_new, write
 
@@ -39,17 +37,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     written `./land`.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments[:1] == ["land"]:
-        return land.main(arguments[1:])
-    parser = _parser()
-    flags = parser.parse_args(arguments)
+    is_land = arguments[:1] == ["land"]
+    parser = land.parser() if is_land else _parser()
+    flags = parser.parse_args(arguments[is_land:])
     try:
-        _import(flags)
+        flags.act(flags)
     except (EmberwatchError, OSError) as error:
         parser.error(str(error))
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> Parser:
     parser = Parser(
         prog="python -m emberwatch.landscape",
         description="Make a recorded world for `emberwatch-server --states` from rasters, "
@@ -59,34 +56,38 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="IN", help="files, or a folder for each sequence")
     add("--out", type=Path, required=True, metavar="FILE.npz", help="also writes FILE.toml")
-    add("--kind", required=True, choices=KINDS, help="meaning of the numbers in the files")
+    add(
+        "--kind",
+        required=True,
+        choices=("arrival", "mask", "burning", "states"),
+        help="meaning of the numbers in the files",
+    )
     add("--step", required=True, metavar="TIME", help="duration of a step, such as '10 min'")
     add("--unit", choices=("ms", "s", "min", "h", "d"), help="unit of times [the file's]")
-    add("--begin", type=float, metavar="X", help="arrival time of step 0 [the earliest]")
-    add("--burning", type=whole, metavar="N", help="steps that a cell burns (arrival, mask)")
+    add(
+        "--begin",
+        type=number(float, -(10**18), 10**18),
+        metavar="X",
+        help="arrival time of step 0 [the earliest]",
+    )
+    add("--burning", type=WHOLE, metavar="N", help="steps that a cell burns (arrival, mask)")
     add("--codes", type=_codes, metavar="U,B,D", help="codes of unburnt, burning, burnt [0,1,2]")
-    add("--height", type=whole, metavar="N", help="rows of the world [the input's]")
-    add("--cell", type=metres, metavar="METRES", help="side of the world's cells on the ground")
+    add("--height", type=WHOLE, metavar="N", help="rows of the world [the input's]")
+    add("--cell", type=METRES, metavar="METRES", help="side of the world's cells on the ground")
     add("--time-column", metavar="NAME", help="column with the times of perimeters")
     add_common(parser)
+    parser.set_defaults(act=_import)
     return parser
 
 
 def _import(flags: argparse.Namespace) -> None:
-    meaning = _meaning(flags)
+    _check(flags)
     check_new(".npz", flags.out, flags.out.with_suffix(".toml"), force=flags.force)
-    is_arrival = meaning.kind == "arrival"
-    choice = Choice(
-        variable=flags.variable,
-        band=flags.band,
-        nodata=flags.nodata or (),
-        cell=flags.cell if is_arrival else None,
-        time_column=flags.time_column,
-    )
+    is_arrival = flags.kind == "arrival"
     sequences, begins, notes = list[NDArray[np.uint8]](), list[str | None](), list[str]()
     for files in stacks(flags.inputs, one_file_each=is_arrival):
-        with closing(read(files, choice)) as layers:
-            fire = times(layers, meaning)
+        with closing(read(files, flags)) as layers:
+            fire = times(layers, flags)
         sequences.append(states(fire))
         begins.append(fire.begin)
         if sequences[-1].shape[1:] != sequences[0].shape[1:]:
@@ -101,7 +102,7 @@ def _import(flags: argparse.Namespace) -> None:
     print(shown(f"{flags.out}: {flags.out.stat().st_size} bytes, sequences: {len(sequences)}"))
 
 
-def _meaning(flags: argparse.Namespace) -> Meaning:
+def _check(flags: argparse.Namespace) -> None:
     for name, kinds in _ONLY_FOR.items():
         if flags.kind not in kinds and getattr(flags, name) is not None:
             flag = name.replace("_", "-")
@@ -112,21 +113,9 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         raise InvalidArgumentError(
             f"--burning: required with --kind {flags.kind}: the number of steps that a cell burns"
         )
-    if flags.begin is not None and not math.isfinite(flags.begin):
-        raise invalid("--begin", "a finite number", flags.begin)
     if None not in (flags.cell, flags.height):
         raise InvalidArgumentError("--cell: cannot be combined with --height")
-    return Meaning(
-        kind=flags.kind,
-        seconds=length(flags.step),
-        unit=flags.unit,
-        begin=flags.begin,
-        burning=flags.burning or 1,
-        codes=flags.codes or (UNBURNT, BURNING, BURNT),
-        oblong=flags.oblong,
-        height=flags.height,
-        cell=flags.cell,
-    )
+    flags.seconds, flags.codes = length(flags.step), flags.codes or (UNBURNT, BURNING, BURNT)
 
 
 def _codes(text: str) -> tuple[float, ...]:

@@ -6,22 +6,20 @@ state of each cell in each step.
 """
 
 import math
+from argparse import Namespace
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, NamedTuple, get_args
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.landscape.grid import check_same, check_square, resampled, target_shape
 from emberwatch.landscape.layers import Layer, where
 from emberwatch.landscape.times import SECONDS, date, schedule, steps_at, unit_of
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
-
-Kind = Literal["arrival", "mask", "burning", "states"]
-KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 
 MOST_STATES: Final = 1 << 31  # maximum size of a sequence, bytes
 #: Numbers below 0 that files use for "no value".
@@ -37,36 +35,16 @@ class Times(NamedTuple):
     arrival: NDArray[np.float64]
     burnt: NDArray[np.float64]
     n_steps: int
-    name: str
-    """Name of the first layer, for errors."""
-    begin: str | None
-    """The date of step 0, if the files have it."""
-    notes: tuple[str, ...]
-    """What was assumed about the input."""
+    name: str  # of the first layer
+    begin: str | None  # the date of step 0
+    notes: tuple[str, ...]  # what was assumed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Meaning:
-    """The interpretation of the numbers in the layers, from the flags (docs/landscapes.md)."""
-
-    kind: Kind
-    seconds: float
-    """Duration of a step."""
-    unit: str | None
-    begin: float | None
-    burning: int
-    codes: tuple[float, ...]
-    oblong: bool
-    height: int | None
-    cell: float | None
-    """Side of the world's cells in metres, instead of `height`."""
-
-
-def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
+def times(layers: Iterable[Layer], flags: Namespace) -> Times:
     """Computes the times of one fire from its layers."""
-    if meaning.kind == "arrival":
-        return _of_arrival(list(layers), meaning)
-    return _of_stack(layers, meaning)
+    if flags.kind == "arrival":
+        return _of_arrival(list(layers), flags)
+    return _of_stack(layers, flags)
 
 
 def states(fire: Times) -> NDArray[np.uint8]:
@@ -86,7 +64,7 @@ def states(fire: Times) -> NDArray[np.uint8]:
     return sequence
 
 
-def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
+def _of_arrival(layers: list[Layer], flags: Namespace) -> Times:
     layer = layers[0]
     if len(layers) != 1:
         raise invalid(layer.name, "one band of arrival times", f"{len(layers)}; choose with --band")
@@ -94,19 +72,19 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     arrival = np.where(np.isfinite(values), values, np.inf)
     if np.isinf(arrival).all():
         raise invalid(layer.name, "cells that burn", "none")
-    _check_negative(layer, meaning)
-    unit = unit_of(layer.unit, meaning.unit, layer.name)
+    _check_negative(layer, flags)
+    unit = unit_of(layer.unit, flags.unit, layer.name)
     if unit is None:
         expected = f"ms, s, min, h or d, as {layer.name} does not state the unit of times"
         raise invalid("--unit", expected, "none")
-    begin = float(arrival.min()) if meaning.begin is None else meaning.begin
+    begin = float(arrival.min()) if flags.begin is None else flags.begin
     latest = float(arrival[np.isfinite(arrival)].max())
-    first, last = _on_world(arrival, arrival, layer, meaning)
+    first, last = _on_world(arrival, arrival, layer, flags)
     moments = np.unique(first[np.isfinite(first)])
     # A step shows the fire at the step's time, so a cell that begins to burn later first burns in
     # the next step.
     first, last, end = (
-        steps_at(np.maximum(at, begin) - begin, meaning.seconds / SECONDS[unit])
+        steps_at(np.maximum(at, begin) - begin, flags.seconds / SECONDS[unit])
         for at in (first, last, np.array([latest]))
     )
     since, until = (
@@ -116,7 +94,7 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     words = f"cells begin to burn at {len(moments)} times from {since} to {until}"
     return Times(
         arrival=first,
-        burnt=last + meaning.burning,
+        burnt=last + flags.burning,
         n_steps=n_steps,
         name=layer.name,
         begin=date(begin, layer.unit),
@@ -124,24 +102,24 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     )
 
 
-def _check_negative(layer: Layer, meaning: Meaning) -> None:
+def _check_negative(layer: Layer, flags: Namespace) -> None:
     """Refuses times below 0, which mostly mean "never", unless `--begin` says that they are times.
 
     Even then, refuses the usual codes for "no value".
     """
     negative = np.isfinite(layer.values) & (layer.values < 0)
-    if meaning.begin is not None:
+    if flags.begin is not None:
         negative &= np.isin(layer.values, _CODES)
     if negative.any():
         remedy = "if it means never, give --nodata; if the cell burnt before, --begin 0"
         raise invalid(layer.name, "times of at least 0", f"{_first(layer, negative)}; {remedy}")
 
 
-def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
+def _of_stack(layers: Iterable[Layer], flags: Namespace) -> Times:
     read = list[Layer]()
     state, mark, n_missing = np.empty(0, np.uint8), math.nan, 0
     arrival = burnt = np.empty(0)  # numbers of layers
-    unburnt = meaning.codes[UNBURNT] if meaning.kind == "states" else 0.0
+    unburnt = flags.codes[UNBURNT] if flags.kind == "states" else 0.0
     for k, layer in enumerate(layers):
         if not read:
             state = np.zeros(layer.place.shape, np.uint8)
@@ -151,25 +129,28 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
         missing = np.isnan(layer.values)
         n_missing += np.count_nonzero(missing)
         layer.values[missing] = unburnt
-        if meaning.kind == "states":
-            now = _coded(layer, meaning)
+        if flags.kind == "states":
+            now = _coded(layer, flags)
         else:
-            now, mark = _marked(layer, meaning, state, mark)
-        _check_order(layer, state, now)
+            now, mark = _marked(layer, flags, state, mark)
+        again = now < state
+        if again.any():
+            got = f"{again.sum()} that burn or are unburnt again, the first {where(again)}"
+            raise invalid(layer.name, "cells that burn once and stay burnt", got)
         state = now
         arrival[(state >= BURNING) & np.isinf(arrival)] = k
         burnt[(state == BURNT) & np.isinf(burnt)] = k
     first = read[0]
-    steps = schedule(read, step=meaning.seconds, unit=meaning.unit)
+    steps = schedule(read, step=flags.seconds, unit=flags.unit)
     if np.isinf(arrival).all():
         raise invalid(first.name, "cells that burn", "none")
-    is_mask = meaning.kind == "mask"
-    both = _on_world(arrival, arrival if is_mask else burnt, first, meaning)
+    is_mask = flags.kind == "mask"
+    both = _on_world(arrival, arrival if is_mask else burnt, first, flags)
     arrival, burnt = (_at(one, steps) for one in both)
     note = f"{n_missing} cells of layers have no value, and count as unburnt"
     return Times(
         arrival=arrival,
-        burnt=burnt + meaning.burning if is_mask else burnt,
+        burnt=burnt + flags.burning if is_mask else burnt,
         n_steps=int(steps[-1]) + 1,
         name=first.name,
         begin=None if first.time is None else date(first.time, first.time_unit),
@@ -178,12 +159,12 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
 
 
 def _on_world(
-    arrival: NDArray[Any], burnt: NDArray[Any], layer: Layer, meaning: Meaning
+    arrival: NDArray[Any], burnt: NDArray[Any], layer: Layer, flags: Namespace
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Returns both times of each cell, resampled to the world's grid."""
-    if not meaning.oblong:
+    if not flags.oblong:
         check_square(layer.place, layer.name)
-    shape = target_shape(layer.place, height=meaning.height, cell=meaning.cell)
+    shape = target_shape(layer.place, height=flags.height, cell=flags.cell)
     if shape == arrival.shape:
         return arrival, burnt
     # A larger cell is burnt once all of its input cells that ever burn are burnt.
@@ -192,22 +173,21 @@ def _on_world(
     return first, np.where(np.isfinite(first), last, np.inf)
 
 
-def _coded(layer: Layer, meaning: Meaning) -> NDArray[np.uint8]:
-    """Returns the states that codes mean."""
-    now = np.full(layer.values.shape, len(meaning.codes), np.uint8)
-    for state, code in enumerate(meaning.codes):
+def _coded(layer: Layer, flags: Namespace) -> NDArray[np.uint8]:
+    now = np.full(layer.values.shape, len(flags.codes), np.uint8)
+    for state, code in enumerate(flags.codes):
         now[layer.values == code] = state
-    unknown = now == len(meaning.codes)
+    unknown = now == len(flags.codes)
     if unknown.any():
-        codes = ", ".join(f"{code:.6g}" for code in meaning.codes)
+        codes = ", ".join(f"{code:.6g}" for code in flags.codes)
         raise invalid(layer.name, f"the codes {codes}", _first(layer, unknown))
     return now
 
 
 def _marked(
-    layer: Layer, meaning: Meaning, before: NDArray[np.uint8], mark: float
+    layer: Layer, flags: Namespace, before: NDArray[np.uint8], mark: float
 ) -> tuple[NDArray[np.uint8], float]:
-    """Returns the states that a mask means, and the number that marks its cells."""
+    """Returns the states, and the number that marks cells."""
     burning = layer.values != 0
     if math.isnan(mark) and burning.any():
         mark = float(layer.values[burning][0])
@@ -217,21 +197,9 @@ def _marked(
         expected = "0 and only one other number, above 0, in all layers"
         raise invalid(layer.name, expected, f"{_first(layer, wrong)}; {remedy}")
     now = burning.astype(np.uint8)
-    if meaning.kind == "burning":
+    if flags.kind == "burning":
         now[~burning & (before >= BURNING)] = BURNT
     return now, mark
-
-
-def _check_order(layer: Layer, before: NDArray[np.uint8], now: NDArray[np.uint8]) -> None:
-    """Refuses a cell whose state cannot follow its state in the previous layer."""
-    for state, words in (
-        (BURNING, "burnt cells to stay burnt, got {} that burn again"),
-        (UNBURNT, "burning cells not to become unburnt, got {} that are unburnt again"),
-    ):
-        wrong = (now == state) & (before > state)
-        if wrong.any():
-            words = words.format(wrong.sum())
-            raise InvalidArgumentError(f"{layer.name}: expected {words}, the first {where(wrong)}")
 
 
 def _at(layers: NDArray[np.floating[Any]], steps: NDArray[np.float64]) -> NDArray[np.float64]:

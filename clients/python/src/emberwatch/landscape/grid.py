@@ -1,6 +1,7 @@
 """Grids on the ground: their size, whether layers have one grid, and resampling to larger cells."""
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
@@ -8,7 +9,6 @@ from numpy.typing import NDArray
 
 from emberwatch._native import MAX_SIDE
 from emberwatch.errors import invalid
-from emberwatch.landscape.libraries import library
 
 LIKE: Final = 1e-3
 """Tolerance between the positions of two grids, as a share of a cell."""
@@ -23,14 +23,10 @@ _EXACT: Final = 2e-3
 class Place:
     """The grid of a file on the ground."""
 
-    shape: tuple[int, int]
-    """Rows and columns."""
-    corner: tuple[float, float] | None = None
-    """x and y of the north-west corner; None if unknown."""
-    cell: tuple[float, float] = (1.0, 1.0)
-    """Width and height of a cell, in units of x and y."""
-    crs: Any = None
-    """The coordinate reference system, a `pyproj.CRS`; None if unknown."""
+    shape: tuple[int, int]  # rows and columns
+    corner: tuple[float, float] | None = None  # x and y of the north-west corner, if known
+    cell: tuple[float, float] = (1.0, 1.0)  # width and height, in units of x and y
+    crs: Any = None  # a `pyproj.CRS`; None if unknown
 
     def ground(self) -> tuple[float, float] | None:
         """Returns width and height of the middle cell in metres; None if these are unknown.
@@ -43,7 +39,7 @@ class Place:
         (rows, columns), (width, height) = self.shape, self.cell
         x, y = self.corner[0] + columns * width / 2, self.corner[1] - rows * height / 2
         edges = [x - width / 2, x + width / 2, x, x], [y, y, y - height / 2, y + height / 2]
-        transformer = library("pyproj").Transformer
+        transformer = import_module("pyproj").Transformer
         to_degrees = transformer.from_crs(self.crs, self.crs.geodetic_crs, always_xy=True)
         lon, lat = np.array(to_degrees.transform(*edges))
         # Two lines on the ellipsoid, along the cell's row and along its column.

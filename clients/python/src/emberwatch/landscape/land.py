@@ -2,7 +2,6 @@
 
 import argparse
 import io
-from collections.abc import Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -11,53 +10,51 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES, MAX_SIDE
+from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES
+from emberwatch.common.output import Parser, number
 from emberwatch.common.paths import shown, utf8
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
-from emberwatch.landscape.elevation import UNITS, slopes
-from emberwatch.landscape.flags import Parser, add_common, metres
-from emberwatch.landscape.grid import check_same
+from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.landscape.flags import METRES, add_common
+from emberwatch.landscape.grid import check_same, target_shape
 from emberwatch.landscape.inputs import read, stacks
-from emberwatch.landscape.layers import Choice, Layer, check_full
-from emberwatch.landscape.terrain import model_text, slope_and_wind
+from emberwatch.landscape.layers import Layer, check_full
+from emberwatch.landscape.terrain import UNITS, model_text, slope_and_wind, slopes
 from emberwatch.landscape.world import check_new
 
 _NAME: Final = "python -m emberwatch.landscape land"
 _MOST_FACTOR: Final = 1e6  # maximum factor of a map
-_MOST_WIND: Final = 100.0  # maximum wind speed, m/s: more than any hurricane
 _POINTS: Final = tuple("N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW".split())
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Makes the model file that the flags describe; exits with code 2 and a message on an error."""
-    parser = _parser()
-    flags = parser.parse_args(arguments)
-    try:
-        _make(flags)
-    except (EmberwatchError, OSError) as error:
-        parser.error(str(error))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
+def parser() -> Parser:
+    """Returns the parser of the command."""
+    made = Parser(
         prog=_NAME,
         description="Make a model file with maps from rasters. docs/land.md describes the flags.",
     )
-    add = parser.add_argument
+    add = made.add_argument
     add("elevation", type=Path, nargs="?", metavar="ELEVATION", help="raster of heights")
     add("--out", type=Path, required=True, metavar="FILE.toml", help="its maps go to FILE.npz")
-    add("--cell", type=metres, metavar="METRES", help="side of a cell without a projection")
+    add("--cell", type=METRES, metavar="METRES", help="side of a cell without a projection")
     add("--height-unit", choices=tuple(UNITS), help="unit of the heights [the raster's, or m]")
-    add("--wind-speed", type=float, default=0.0, metavar="M/S", help="speed of the wind [0]")
+    add(
+        "--wind-speed",
+        type=number(float, 0.0, 100.0),
+        default=0.0,
+        metavar="M/S",
+        help="speed of the wind [0]",
+    )
     add("--wind-from", type=_bearing, metavar="POINT|DEGREES", help="such as NNE, or 22.5")
     add("--fuel", type=Path, metavar="RASTER", help="whole numbers, each a class of fuel")
     add("--factors", type=_factors, metavar="N=X,N=X", help="factors of the hazard of classes [1]")
     add("--no-fly", type=Path, metavar="RASTER", help="a number above 0 is a no-fly cell")
-    add_common(parser)
-    return parser
+    add_common(made)
+    made.set_defaults(kind=None, act=make)
+    return made
 
 
-def _make(flags: argparse.Namespace) -> None:
+def make(flags: argparse.Namespace) -> None:
+    """Makes the model file that the flags describe."""
     _check_flags(flags)
     out: Path = flags.out
     maps_file, no_fly_file = out.with_suffix(".npz"), out.with_suffix(".no_fly.npy")
@@ -99,8 +96,6 @@ def _check_flags(flags: argparse.Namespace) -> None:
         raise invalid("--fuel", "both --fuel and --factors, or neither", "only one of them")
     if flags.elevation is None and (flags.cell, flags.height_unit) != (None, None):
         raise InvalidArgumentError("--cell and --height-unit: apply only with ELEVATION")
-    if not 0.0 <= flags.wind_speed <= _MOST_WIND:
-        raise invalid("--wind-speed", f"0 to {_MOST_WIND:g} m/s", flags.wind_speed)
     if (flags.wind_speed > 0.0) != (flags.wind_from is not None):
         both = "both a --wind-speed above 0 and --wind-from"
         raise invalid("wind", f"{both}, or neither", "only one of them")
@@ -108,29 +103,24 @@ def _check_flags(flags: argparse.Namespace) -> None:
 
 def _layers(flags: argparse.Namespace) -> dict[str, Layer]:
     """Reads the rasters, by the names of their flags; refuses rasters on different grids."""
-    choice = Choice(variable=flags.variable, band=flags.band, nodata=flags.nodata or ())
     layers = dict[str, Layer]()
     for key in ("elevation", "fuel", "no_fly"):
         file = getattr(flags, key)
         if file is not None:
-            layers[key] = layer = _layer(file, choice)
+            layers[key] = layer = _layer(file, flags)
             first = next(iter(layers.values()))
             check_same(layer.place, layer.name, first.place, first.name)
     return layers
 
 
-def _layer(file: Path, choice: Choice) -> Layer:
+def _layer(file: Path, flags: argparse.Namespace) -> Layer:
     (files,) = stacks([file], one_file_each=False)
-    with closing(read(files, choice)) as layers:
+    with closing(read(files, flags)) as layers:
         found = list(islice(layers, 2))
     if len(found) != 1:
         raise invalid(file, "one layer", "several; choose with --band")
-    (layer,) = found
-    height, width = layer.place.shape
-    if max(height, width) > MAX_SIDE:
-        most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum"
-        raise invalid(layer.name, most, f"{height} x {width}")
-    return layer
+    target_shape(found[0].place, height=None, cell=None)  # refuses too many cells
+    return found[0]
 
 
 def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """Layers, which are values with the positions of their cells, and helpers for all readers."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,34 +16,19 @@ SINCE_1970: Final = "seconds since 1970-01-01"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """The part of each file to read, from the flags (docs/landscapes.md)."""
-
-    variable: str | None = None
-    band: int | None = None
-    nodata: Sequence[float] = ()
-    cell: float | None = None
-    """Side of the cells that perimeters and detections are drawn on, metres; None: refuse these."""
-    time_column: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Layer:
     """One raster."""
 
     name: str
-    """File and band, for errors."""
     values: NDArray[np.floating]
     """Shape (rows, columns), the first row in the north; NaN in cells without a value."""
     place: Place
     unit: str = ""
     """The unit of the values, as the file writes it, or `SINCE_1970`."""
     time: float | None = None
-    """The time of the layer, if the file states it."""
     time_unit: str = ""
-    """The unit of `time`, as the file writes it, or `SINCE_1970`."""
-    notes: tuple[str, ...] = ()
-    """What the reader assumed."""
+    """The unit of `time`, like `unit`."""
+    notes: tuple[str, ...] = ()  # what the reader assumed
 
 
 def check_full(layer: Layer, expected: str, remedy: str) -> None:
@@ -60,9 +45,10 @@ def where(cells: NDArray[np.bool_]) -> str:
     return f"in row {row}, column {column}"
 
 
-def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str:
+def choose_variable(file: Path, names: Iterable[str], wanted: str | None) -> str:
     """Returns the name of the wanted variable in a file, or of its only variable."""
-    known = ", ".join(sorted(names)) or "none"
+    names = sorted(names)
+    known = ", ".join(names) or "none"
     if wanted is not None and wanted not in names:
         raise invalid("--variable", f"a variable of {file} ({known})", f"'{wanted}'")
     if wanted is None and len(names) != 1:
@@ -70,10 +56,10 @@ def choose_variable(file: Path, names: Sequence[str], wanted: str | None) -> str
     return wanted or names[0]
 
 
-def choose_bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
+def choose_bands(file: Path, count: int, wanted: int | None) -> Sequence[int]:
     """Returns the numbers of the bands to read, counted from 1."""
-    if choice.band is None:
+    if wanted is None:
         return range(1, count + 1)
-    if choice.band > count:
-        raise invalid("--band", f"1 to {count} for {file}", choice.band)
-    return [choice.band]
+    if wanted > count:
+        raise invalid("--band", f"1 to {count} for {file}", wanted)
+    return [wanted]

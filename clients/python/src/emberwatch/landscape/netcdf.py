@@ -1,7 +1,8 @@
 """Reader of NetCDF files. xarray unpacks numbers and dates; CF attributes state axes and grid."""
 
-import warnings
+from argparse import Namespace
 from collections.abc import Generator, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.common.paths import utf8
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import invalid
 from emberwatch.landscape.grid import Place
-from emberwatch.landscape.layers import SINCE_1970, Choice, Layer, choose_bands, choose_variable
-from emberwatch.landscape.libraries import library
+from emberwatch.landscape.layers import SINCE_1970, Layer, choose_bands, choose_variable
 
 #: Standard names, units and attributes `axis` of coordinates, or names of dimensions, by axis.
 _ROWS: Final = "y projection_y_coordinate latitude degrees_north lat northing".split()
@@ -21,29 +21,21 @@ _LAYERS: Final = "t time date step layer band".split()
 _EVEN: Final = 0.1  # tolerance for positions, as a share of a cell, as 32-bit numbers are rounded
 
 
-def read(file: Path, choice: Choice) -> Generator[Layer]:
+def read(file: Path, flags: Namespace) -> Generator[Layer]:
     """Yields a layer for each time of a variable. The file is closed after the last layer."""
-    xarray, path = library("xarray"), utf8("file", file.absolute())
-    library("rioxarray")  # adds `rio` to arrays
+    xarray, path = import_module("xarray"), utf8("file", file.absolute())
+    import_module("rioxarray")  # adds `rio` to arrays
     options = {"engine": "netcdf4", "decode_coords": "all", "decode_timedelta": False}
-    with warnings.catch_warnings(action="ignore"):
-        try:
-            with xarray.open_dataset(path, cache=False, **options) as dataset:
-                arrays = {
-                    str(name): array
-                    for name, array in dataset.data_vars.items()
-                    if array.ndim > 1 and array.dtype.kind in "biufM"
-                }
-                name = choose_variable(file, list(arrays), choice.variable)
-                yield from _layers(file, arrays[name], choice)
-        except InvalidArgumentError:
-            raise
-        except Exception as error:  # netCDF4, xarray and pyproj raise different errors
-            words = getattr(error, "strerror", None) or error
-            raise InvalidArgumentError(f"{file}: expected a NetCDF file, got: {words}") from None
+    with xarray.open_dataset(path, cache=False, **options) as dataset:
+        arrays = {
+            str(name): array
+            for name, array in dataset.data_vars.items()
+            if array.ndim > 1 and array.dtype.kind in "biufM"
+        }
+        yield from _layers(file, arrays[choose_variable(file, arrays, flags.variable)], flags)
 
 
-def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
+def _layers(file: Path, array: Any, flags: Namespace) -> Iterator[Layer]:
     if 0 in array.shape:
         raise invalid(file, "cells", f"an array of shape {array.shape}")
     rows = _dimension(array, _ROWS, array.dims[-2])
@@ -57,7 +49,7 @@ def _layers(file: Path, array: Any, choice: Choice) -> Iterator[Layer]:
     time = array.coords.get(layers if array.ndim == 3 else "time")
     array = array if array.ndim == 3 else array.expand_dims("layer")
     times, time_unit = (None, "") if time is None else _numbers(time)
-    for band in choose_bands(file, len(array), choice):
+    for band in choose_bands(file, len(array), flags.band):
         values, unit = _numbers(array[band - 1])
         yield Layer(
             name=f"{file}, band {band}" if len(array) > 1 else str(file),
@@ -123,7 +115,7 @@ def _line(file: Path, one: Any) -> tuple[float, float]:
 
 def _crs(array: Any, x: Any) -> Any:
     """Returns the projection of the grid mapping; degrees without one refer to WGS 84."""
-    pyproj, crs = library("pyproj"), array.rio.crs
+    pyproj, crs = import_module("pyproj"), array.rio.crs
     if crs is not None:
         return pyproj.CRS.from_wkt(crs.to_wkt())
     is_angle = str(x.attrs.get("units", "")).lower().startswith("degree")

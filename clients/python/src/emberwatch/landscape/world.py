@@ -11,14 +11,19 @@ from numpy.typing import NDArray
 from emberwatch.common.paths import utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 
-#: The states: name, colour and reward.
-_STATES: Final = (
-    ("unburnt", "#3b6ea5", 0.0),
-    ("burning", "#c8371b", 1.0),
-    ("burnt", "#4a4a4a", 0.0),
-)
 # As in the wildfire model, the sensor errs in 2 % of the cells, equally often with each error.
-_RIGHT, _WRONG = 0.98, 0.01
+_STATES: Final = """
+states = [
+    { name = "unburnt", color = "#3b6ea5", observed_as = [0.98, 0.01, 0.01], reward = 0.0 },
+    { name = "burning", color = "#c8371b", observed_as = [0.01, 0.98, 0.01], reward = 1.0 },
+    { name = "burnt", color = "#4a4a4a", observed_as = [0.01, 0.01, 0.98], reward = 0.0 },
+]
+observations = [
+    { name = "unburnt", color = "#3b6ea5" },
+    { name = "burning", color = "#c8371b" },
+    { name = "burnt", color = "#4a4a4a" },
+]
+"""
 
 
 def write(
@@ -27,24 +32,14 @@ def write(
     """Writes the `.npz` and its `.toml`; `begins`: dates of step 0 of the sequences, if known."""
     digits = max(3, len(str(len(sequences) - 1)))  # sorting the names as text keeps their order
     names = [f"states_{number:0{digits}}" for number in range(len(sequences))]
-    text = description(utf8("--out", out.stem), step, dict(zip(names, begins, strict=True)))
+    known = zip(names, begins, strict=True)
+    lines = [f"name = {quoted(utf8('--out', out.stem))}"]
+    lines += [f"step = {quoted(step)} # duration of a step"]
+    lines += [f"# {array} begins at {begin}" for array, begin in known if begin]
     out.parent.mkdir(parents=True, exist_ok=True)
     arrays = dict(zip(names, sequences, strict=True))
     np.savez_compressed(out, **arrays)  # pyright: ignore
-    out.with_suffix(".toml").write_text(text, "utf-8")
-
-
-def description(name: str, step: str, begins: dict[str, str | None]) -> str:
-    """Returns the text of the `.toml`."""
-    lines = [f"name = {quoted(name)}", f"step = {quoted(step)} # duration of a step"]
-    lines += [f"# {array} begins at {begin}" for array, begin in begins.items() if begin]
-    for state, color, reward in _STATES:
-        row = ", ".join(str(_RIGHT if other == state else _WRONG) for other, _, _ in _STATES)
-        lines += ["", "[[states]]", f'name = "{state}"', f'color = "{color}"']
-        lines += [f"observed_as = [{row}]", f"reward = {reward}"]
-    for state, color, _ in _STATES:
-        lines += ["", "[[observations]]", f'name = "{state}"', f'color = "{color}"']
-    return "\n".join(lines) + "\n"
+    out.with_suffix(".toml").write_text("\n".join(lines) + "\n" + _STATES, "utf-8")
 
 
 def quoted(text: str) -> str:

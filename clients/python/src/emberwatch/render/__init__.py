@@ -36,17 +36,12 @@ _MOST_WIDE_ROWS = 32  # maximum number of rows that fit a terminal with one line
 class Picture:
     """The contents of a picture of one world."""
 
-    frame: NDArray[np.uint8]
-    """Observed values, 255 in unobserved cells, shape (H, W)."""
+    frame: NDArray[np.uint8]  # observed values, 255 in unobserved cells, (H, W)
     palette: Palette
-    robots: Sequence[tuple[int, int]] = ()
-    """The cell (row, column) of each robot to draw."""
-    paths: Sequence[NDArray[np.intp]] = ()
-    """The visited cells (row, column) of each robot that flew, in order, shape (n, 2)."""
-    truth: NDArray[np.uint8] | None = None
-    """The hidden states, shape (H, W); None if they are unknown."""
+    robots: Sequence[tuple[int, int]] = ()  # the cell of each robot: row, column
+    paths: Sequence[NDArray[np.intp]] = ()  # the visited cells of each robot that flew, (n, 2)
+    truth: NDArray[np.uint8] | None = None  # the hidden states, (H, W), if known
     airspace: Airspace = Airspace()  # noqa: RUF009
-    """The no-fly cells and the range of the sensor."""
 
     def color_of(self, robot: int) -> Color | None:
         """Returns the colour of a robot of a team; None for a single robot."""
@@ -56,17 +51,10 @@ class Picture:
 def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8]:
     """Draws a frame with paths and robots, and the hidden states next to it (below on wide grids).
 
-    A path is a line, or a tint if cells are smaller than 3 pixels. The size of the image depends
-    only on the grid, the scale, and whether hidden states are known. Width and height are even, as
-    video codecs require.
-
-    Args:
-        picture: The contents.
-        scale: Side of a cell in pixels, at least 1. None: the longer side of a panel is about 512
-            pixels.
-
-    Returns:
-        An image of shape (height, width, 3): red, green, blue.
+    A path is a line, or a tint if cells are smaller than 3 pixels. `scale` is the side of a cell in
+    pixels; None: the longer side of a panel is about 512 pixels. The image has shape (height,
+    width, 3). Its size depends only on the grid, the scale, and whether hidden states are known;
+    both sides are even, as video codecs require.
     """
     height, width = picture.frame.shape
     if scale is None:  # an even number, unless cells are too small
@@ -111,7 +99,7 @@ def _panels(picture: Picture, scale: int) -> list[NDArray[np.uint8]]:
         panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
     if no_fly is not None:
         for panel in panels:
-            _draw_hatches(panel, no_fly, scale)
+            draw_hatches(panel, no_fly, scale)
     if scale >= _LEAST_LINE_SCALE:
         seen = (frame != UNOBSERVED)[:, :, np.newaxis]
         ink = np.where(seen, palette.path, mark_on(np.array(palette.unobserved)))
@@ -139,7 +127,8 @@ def _draw_outline(image: NDArray[np.uint8], seen: NDArray[np.bool_], scale: int)
     image[line] = mark_on(image[line])
 
 
-def _draw_hatches(image: NDArray[np.uint8], no_fly: NDArray[np.bool_], scale: int) -> None:
+def draw_hatches(image: NDArray[np.uint8], no_fly: NDArray[np.bool_], scale: int) -> None:
+    """Draws lines over the no-fly cells of an image whose cells have `scale` pixels."""
     rows, cols = np.ogrid[: image.shape[0], : image.shape[1]]
     period = min(max(scale, _LEAST_HATCH), _MOST_HATCH)
     lines = _enlarge(no_fly, scale) & (np.remainder(rows + cols, period) < max(1, period // 4))

@@ -17,7 +17,7 @@ from emberwatch.belief.prior import prior_of
 from emberwatch.client import recording
 from emberwatch.client.observer import Truth
 from emberwatch.client.replies import ServerInfo
-from emberwatch.common.output import end_with_reader
+from emberwatch.common.output import Parser, end_with_reader, number
 from emberwatch.common.paths import shown
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.model import Model
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=_NAME,
         description="Make a film or a still of a recording: the hidden states, the robots' frames, "
         "and the belief of the known model's filter.",
@@ -70,28 +70,33 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("recording", type=Path, help="a recording of `emberwatch-server record`")
     add("--out", type=Path, required=True, metavar="FILE", help="a .gif, or with --step a .png")
-    step, count = partial(_number, int, 0, math.inf), partial(_number, int, 1, math.inf)
+    step = number(int, 0, math.inf)
     add("--step", type=step, metavar="K", help="make a still of this step")
     add("--from", dest="first", type=step, default=0, metavar="K", help="first step to show [0]")
     add("--to", dest="last", type=step, default=math.inf, metavar="K", help="last step [the last]")
-    add("--every", type=count, default=1, metavar="N", help="show every N-th step [1]")
-    fps = partial(_number, float, 0.1, 50)
-    add("--fps", type=fps, default=10.0, metavar="N", help="pictures per second, 0.1 to 50 [10]")
+    add(
+        "--every",
+        type=number(int, 1, math.inf),
+        default=1,
+        metavar="N",
+        help="show every N-th step [1]",
+    )
+    add(
+        "--fps",
+        type=number(float, 0.1, 50),
+        default=10.0,
+        metavar="N",
+        help="pictures per second, 0.1 to 50 [10]",
+    )
     add("--world", type=int, default=0, metavar="N", help="number of the world [0]")
-    scale = partial(_number, int, 1, 100)
-    add("--scale", type=scale, metavar="N", help="side of a cell in pixels [panels of about 200]")
+    add(
+        "--scale",
+        type=number(int, 1, 100),
+        metavar="N",
+        help="side of a cell in pixels [panels of about 200]",
+    )
     add("--model", metavar="FILE", help="a model file [the recorded one]")
     return parser
-
-
-def _number(kind: type[float], least: float, most: float, text: str) -> float:
-    try:
-        number = kind(text)
-    except ValueError:
-        number = math.nan
-    if not least <= number <= most:
-        raise argparse.ArgumentTypeError(f"expected {least} to {most}, got {text}")
-    return number
 
 
 def _contents(path: Path, world: int) -> tuple[ServerInfo, bool]:

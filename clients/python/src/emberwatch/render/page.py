@@ -11,9 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 from emberwatch.belief import entropy
 from emberwatch.client.replies import ServerInfo
 from emberwatch.model import Color, Model
-from emberwatch.model.airspace import Airspace
 from emberwatch.model.moves import fly
-from emberwatch.render import Picture, rgb_array
+from emberwatch.render import Picture, draw_hatches, rgb_array
 from emberwatch.render.palette import LIGHT, Palette
 from emberwatch.render.scenes import Scene
 
@@ -103,8 +102,9 @@ class Page:
                 seen = []  # the legend of the hidden states names the same colours
         seen.append((_swatch(palette.unobserved), "not seen"))
         if self._server.airspace.no_fly is not None:
-            closed = Airspace(no_fly=np.ones((4, 4), np.bool_))
-            seen.append((_swatch(LIGHT, closed), "no-fly"))
+            closed = np.full((_SWATCH, _SWATCH, 3), LIGHT, np.uint8)
+            draw_hatches(closed, np.ones((4, 4), np.bool_), scale=3)
+            seen.append((_framed(closed), "no-fly"))
         robot = Picture(frame=np.zeros((1, 1), np.uint8), palette=self._shades, robots=[(0, 0)])
         yield "seen in this step", [*seen, (rgb_array(robot, scale=_SWATCH), "robot")]
         if self._model is not None:
@@ -154,15 +154,11 @@ class Page:
 def _write(
     image: Image.Image, at: tuple[float, float], text: str, font: ImageFont.FreeTypeFont = _TEXT
 ) -> None:
-    """Writes text with its left edge and middle at `at`."""
     ImageDraw.Draw(image).text(at, text, _INK, font, "lm")
 
 
-def _swatch(color: Color, airspace: Airspace = Airspace()) -> NDArray[np.uint8]:  # noqa: B008
-    """Returns a framed square of a colour."""
-    palette = Palette(states=(), observations=(color,), unobserved=color, path=color)
-    frame = np.zeros((4, 4), np.uint8)
-    return _framed(rgb_array(Picture(frame=frame, palette=palette, airspace=airspace), scale=3))
+def _swatch(color: Color) -> NDArray[np.uint8]:
+    return _framed(np.full((_SWATCH, _SWATCH, 3), color, np.uint8))
 
 
 def _framed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

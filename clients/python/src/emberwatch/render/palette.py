@@ -35,13 +35,9 @@ class Palette:
     """The colours of states, observed values, unobserved cells and paths."""
 
     states: tuple[Color, ...]
-    """One colour for each state."""
     observations: tuple[Color, ...]
-    """One colour for each observed value."""
-    unobserved: Color
-    """A grey that differs from all other colours."""
-    path: Color
-    """Colour of a path over observed cells: dark or light, whichever has more contrast to them."""
+    unobserved: Color  # a grey that differs from all other colours
+    path: Color  # over observed cells: dark or light, whichever has more contrast to them
 
     @classmethod
     def of(cls, source: Description | int, *, on_paper: bool = False) -> Self:

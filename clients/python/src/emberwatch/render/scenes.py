@@ -23,31 +23,18 @@ class Scene:
     """The contents of one picture."""
 
     frame: Frame
-    """The robots' frames and paths, and the step's result."""
-    truth: NDArray[np.uint8] | None
-    """The hidden states, `(H, W)`; None if they are not recorded."""
-    belief: NDArray[np.float32] | None
-    """The posterior, `(S, H, W)`; None without a model."""
-    since: int
-    """The first recorded step of the episode, at which the belief began."""
-    n_lost: int
-    """Number of missing steps since then."""
-    mean_reward: float
-    """Mean reward of the recorded steps since then."""
+    truth: NDArray[np.uint8] | None  # (H, W); None if it is not recorded
+    belief: NDArray[np.float32] | None  # the posterior, (S, H, W); None without a model
+    since: int  # the first recorded step of the episode, at which the belief began
+    n_lost: int  # number of missing steps since then
+    mean_reward: float  # of the recorded steps since then
 
 
 def scenes(records: Iterable[Record], begin: Callable[[int], Belief] | None) -> Iterator[Scene]:
-    """Yields a scene for each recorded step of one world.
+    """Yields a scene for each recorded step of one world. A frame published again counts once.
 
-    A frame that was published again counts once.
-
-    Args:
-        records: The records of the world.
-        begin: Makes the belief before the frame of a step k; None without a model.
-
-    Warns:
-        UserWarning: If worlds of another kind follow, from another server. These worlds are left
-            out.
+    `begin` makes the belief before the frame of a step k; None without a model. Warns if worlds of
+    another kind follow, from another server, which are left out.
     """
     server = last = belief = None
     truths: dict[tuple[int, int, int], NDArray[np.uint8]] = {}
