@@ -195,8 +195,7 @@ impl Options {
         results: PyReadonlyArray1<'_, u8>,
     ) -> PyResult<Plans<'py>> {
         let (chosen, results) = (chosen.as_slice()?, results.as_slice()?);
-        let plans = self.worlds.with(py, |it| it.plan(chosen, results))?;
-        let (features, paths) = plans.map_err(|error| raise(py, &error))?;
+        let (features, paths) = self.worlds.with(py, |it| it.plan(chosen, results))?;
         Ok((features.into_pyarray(py), paths.into_pyarray(py)))
     }
 
