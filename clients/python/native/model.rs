@@ -43,21 +43,13 @@ pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDic
     Ok(fields)
 }
 
-/// Returns the text of a model file with its sensor radius replaced. The radius is in rows and columns beyond the path.
+/// Returns the text of a model file or a description with another sensor radius, in rows and columns.
 #[pyfunction]
-pub fn model_with_radius(text: &str, radius: usize) -> PyResult<String> {
-    let model = model_of(text)?.with_radius(radius).map_err(refused)?;
-    toml::to_string(model.file()).map_err(refused)
-}
-
-/// Returns the text of a description with its sensor radius replaced.
-#[pyfunction]
-pub fn description_with_radius(text: &str, radius: usize) -> PyResult<String> {
-    let mut description: Description = toml::from_str(text).map_err(refused)?;
-    let model = description.unchanging().map_err(refused)?;
-    let model = model.with_radius(radius).map_err(refused)?;
-    description.sensor = model.file().sensor.clone();
-    toml::to_string(&description).map_err(refused)
+pub fn with_radius(text: &str, radius: i64) -> PyResult<String> {
+    let mut file: toml::Table = toml::from_str(text).map_err(refused)?;
+    let sensor = toml::Table::from_iter([("radius".into(), radius.into())]);
+    file.insert("sensor".into(), sensor.into());
+    toml::to_string(&file).map_err(refused)
 }
 
 /// Returns the fields of a description of recorded worlds, by name.

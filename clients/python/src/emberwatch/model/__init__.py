@@ -69,7 +69,7 @@ class Description:
         radius = as_count(radius, "radius", 0, _native.MAX_RADIUS)
         if radius == self.airspace.radius:
             return self
-        return self.from_toml(self._with_radius(self.toml, radius))
+        return self.from_toml(_native.with_radius(self.toml, radius))
 
     @property
     def sensor_radius(self) -> int:
@@ -108,10 +108,6 @@ class Description:
     def _read(text: str) -> dict[str, Any]:
         """Returns the values of all fields except `toml`."""
         return _native.read_description(text)
-
-    @staticmethod
-    def _with_radius(text: str, radius: int) -> str:
-        return _native.description_with_radius(text, radius)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,10 +208,6 @@ class Model(Description):
         for factors in values["maps"].values():
             factors.flags.writeable = False
         return values
-
-    @staticmethod
-    def _with_radius(text: str, radius: int) -> str:
-        return _native.model_with_radius(text, radius)
 
 
 @functools.lru_cache(maxsize=8)
