@@ -30,14 +30,25 @@ const BRIEF_NANOS: u64 = 1_000_000;
 /// Name of this program in the server's log.
 const NAME: &str = concat!("emberwatch-python ", env!("CARGO_PKG_VERSION"));
 
-/// A connection to a server (see `connect`) or to worlds in this process (see `embed`).
+/// A connection to a running server, or to worlds in this process (see `embed`).
 ///
 /// Close it after use, or use it as a context manager. Threads may share it: their requests run
 /// one after another. Every call waits at most `timeout` seconds for its answer.
 ///
+/// Args:
+///     instance: The server's instance name.
+///     timeout: Seconds to wait for the server's answer.
+///     wait: Seconds to wait for a server that is still starting; 0: fail at once.
+///
 /// Attributes:
 ///     info: A `ServerInfo`, the server's description of itself and its worlds.
 ///     instance: The server's instance name; "(embedded)" for worlds in this process.
+///
+/// Raises:
+///     NoServerError: If no server runs under this name within `wait` seconds.
+///     RequestTimeoutError: If the server does not answer.
+///     EmberwatchError: With code `"version_mismatch"` if the server has another protocol version,
+///         or `"channel"` if the channels cannot be opened or the server has too many clients.
 #[pyclass(frozen, subclass, weakref, dict, module = "emberwatch")]
 pub struct Client {
     pub worlds: Owned<Box<dyn Backend + Send>>,
@@ -52,46 +63,28 @@ pub struct Client {
     nanos_of_robot: AtomicU64,
 }
 
-/// Connects to a running server.
-///
-/// Args:
-///     instance: The server's instance name.
-///     timeout: Seconds to wait for the server's answer.
-///     wait: Seconds to wait for a server that is still starting; 0: fail at once.
-///
-/// Raises:
-///     NoServerError: If no server runs under this name within `wait` seconds.
-///     RequestTimeoutError: If the server does not answer.
-///     EmberwatchError: With code `"version_mismatch"` if the server has another protocol version,
-///         or `"channel"` if the channels cannot be opened or the server has too many clients.
-#[pyfunction]
-#[pyo3(signature = (instance="default", *, timeout=5.0, wait=0.0))]
-pub fn connect(py: Python<'_>, instance: &str, timeout: f64, wait: f64) -> PyResult<Client> {
-    let name = checked(py, instance)?;
-    let mut warned = Ok(());
-    let limits = (duration(py, wait)?, duration(py, timeout)?);
-    let opened = py.detach(|| {
-        let mut has_warned = false;
-        Connection::open_within(&name, NAME, limits, |error| {
-            if !has_warned {
-                let text = format!("{}; waiting up to {wait} s for a server", plain(error));
-                warned = Python::attach(|py| warn_in_log(py, &text));
-            }
-            has_warned = true;
-            warned.is_ok()
-        })
-    });
-    warned?;
-    let opened = opened.map_err(|error| raise(py, error, "'hello'", timeout))?;
-    Client::of(py, instance, Box::new(opened))
-}
-
 #[pymethods]
 impl Client {
     #[new]
-    #[pyo3(signature = (instance="default", *, timeout=5.0))]
-    fn new(py: Python<'_>, instance: &str, timeout: f64) -> PyResult<Self> {
-        connect(py, instance, timeout, 0.0)
+    #[pyo3(signature = (instance="default", *, timeout=5.0, wait=0.0))]
+    fn new(py: Python<'_>, instance: &str, timeout: f64, wait: f64) -> PyResult<Self> {
+        let name = checked(py, instance)?;
+        let mut warned = Ok(());
+        let limits = (duration(py, wait)?, duration(py, timeout)?);
+        let opened = py.detach(|| {
+            let mut has_warned = false;
+            Connection::open_within(&name, NAME, limits, |error| {
+                if !has_warned {
+                    let text = format!("{}; waiting up to {wait} s for a server", plain(error));
+                    warned = Python::attach(|py| warn_in_log(py, &text));
+                }
+                has_warned = true;
+                warned.is_ok()
+            })
+        });
+        warned?;
+        let opened = opened.map_err(|error| raise(py, error, "'hello'", timeout))?;
+        Self::of(py, instance, Box::new(opened))
     }
 
     /// Creates worlds in this process from checked settings; see `embed`.
