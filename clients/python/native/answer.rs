@@ -14,14 +14,12 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::PySlice;
 use std::ops::Range;
 
-/// Total size of one world's result and one robot's result, in bytes.
 pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
 
 /// Results of one robot's step: reward, terminated, truncated, step, number of distinct cells visited, and the robot's
 /// row and column as `[1, 2]`.
 type Numbers<'py> = (f64, bool, bool, u64, u32, Bound<'py, PyArray2<i64>>);
 
-/// Results of many robots' steps, one array per column; `_native.pyi` documents the columns.
 type Columns<'py> = (
     Bound<'py, PyArray1<f64>>,
     Bound<'py, PyArray1<bool>>,
@@ -46,7 +44,6 @@ type Columns<'py> = (
 ///     world_of: The index in `worlds` of each robot's world, `(n_robots,)`.
 #[pyclass(frozen, module = "emberwatch")]
 pub struct StepAnswer {
-    /// Number of robots per world.
     team: u32,
     #[pyo3(get)]
     first_robot: u32,
@@ -57,7 +54,6 @@ pub struct StepAnswer {
     dim: [usize; 3],
     payload: Py<PyArray1<u8>>,
     frames: PyOnceLock<Py<PyArray3<u8>>>,
-    /// The results of the first robot and its world.
     first: (WorldResult, RobotResult),
 }
 
@@ -149,7 +145,6 @@ impl StepAnswer {
 }
 
 impl StepAnswer {
-    /// Builds an answer from a reply's header and its payload.
     pub fn of(
         py: Python<'_>,
         team: u32,
@@ -183,7 +178,6 @@ impl StepAnswer {
         worlds_of(self.first_robot, self.n_robots, self.team).len() * WORLD_BYTES
     }
 
-    /// Returns the number of bytes that precede the frames.
     fn head(&self) -> usize {
         self.worlds_end() + self.n_robots as usize * ROBOT_BYTES
     }
@@ -192,7 +186,6 @@ impl StepAnswer {
         self.head() + self.dim.iter().product::<usize>()
     }
 
-    /// Returns the index of a robot's world. `index` counts from the first robot of this answer.
     fn world_of_robot(&self, index: usize) -> usize {
         let first = self.first_robot / self.team;
         ((self.first_robot + index as u32) / self.team - first) as usize
@@ -264,7 +257,6 @@ pub fn columns<'py>(
     ))
 }
 
-/// Returns the reward of a robot's step. `pays`: see `StepAnswer.numbers`.
 fn paid(pays: u8, world: &WorldResult, robot: &RobotResult) -> f64 {
     match pays {
         0 => robot.reward,

@@ -27,7 +27,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// Steps that are expected to be shorter than this keep the interpreter locked: 1 ms, in nanoseconds.
 const BRIEF_NANOS: u64 = 1_000_000;
 
-/// Name of this program in the server's log.
 const NAME: &str = concat!("emberwatch-python ", env!("CARGO_PKG_VERSION"));
 
 /// A connection to a running server, or to worlds in this process (see `embed`).
@@ -107,7 +106,6 @@ impl Client {
     ///     n_robots: Number of robots.
     ///     takeover: Whether to take robots away from the clients that hold them.
     ///     ttl: Seconds without use after which the lease expires; None: the server's default.
-    ///     timeout: Seconds to wait for the answer.
     ///
     /// Raises:
     ///     EmberwatchError: With code `"busy"` if another client holds one of the robots, or
@@ -142,7 +140,6 @@ impl Client {
     ///     first_robot: The number of the first robot.
     ///     n_robots: Number of robots.
     ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
     #[pyo3(signature = (first_robot=Number(0), n_robots=Number(1), *, team=false, timeout=5.0))]
     #[pyo3(text_signature = "($self, first_robot=0, n_robots=1, *, team=False, timeout=5.0)")]
     fn observe(
@@ -160,11 +157,7 @@ impl Client {
     /// Returns the results and frames of an earlier step k of the episode.
     ///
     /// Args:
-    ///     step: The step k.
-    ///     first_robot: The number of the first robot.
-    ///     n_robots: Number of robots.
-    ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
+    ///     step: The step k. The other arguments are those of `observe`.
     ///
     /// Raises:
     ///     EmberwatchError: With code `"not_kept"` if the server has discarded the step; `detail`
@@ -196,7 +189,6 @@ impl Client {
     ///     path: The file. A relative path starts at this process's working directory.
     ///     first_world: The first world to write.
     ///     n_worlds: Number of worlds; None: all worlds from `first_world` on.
-    ///     timeout: Seconds to wait for the answer.
     ///
     /// Returns:
     ///     The state of each world in the file, a tuple of `WorldInfo`.
@@ -253,23 +245,6 @@ impl Client {
     fn shutdown(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
         let stopped = self.request(py, "'shutdown'", &Request::Shutdown {}, timeout);
         stopped.map(drop)
-    }
-
-    /// Sends a JSON request (PROTOCOL.md section 6), and returns the reply's keys and values.
-    #[pyo3(signature = (request, *, timeout))]
-    fn control<'py>(
-        &self,
-        py: Python<'py>,
-        request: &Bound<'py, PyAny>,
-        timeout: f64,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        let json = py.import("json")?;
-        let text: String = json.call_method1("dumps", (request,))?.extract()?;
-        let limit = duration(py, timeout)?;
-        let answer = self.ask(py, "a control request", timeout, |backend| {
-            backend.control_text(text.as_bytes(), limit)
-        })?;
-        json.call_method1("loads", (answer,))
     }
 
     /// Returns the hidden states of worlds in this process, one `Truth` for each world.
@@ -387,7 +362,6 @@ impl Client {
         self.answered(py, answer, seconds)
     }
 
-    /// Converts an answer to its Python object, or an error to its exception.
     pub fn answered(
         &self,
         py: Python<'_>,
@@ -407,7 +381,6 @@ impl Client {
         self.is_embedded && nanos > 0 && nanos.saturating_mul(n_robots.into()) < BRIEF_NANOS
     }
 
-    /// Records how long a step of this number of robots took.
     pub fn took(&self, nanos: u64, n_robots: u32) {
         let nanos = nanos / u64::from(n_robots.max(1));
         self.nanos_of_robot.store(nanos.max(1), Ordering::Relaxed);
@@ -418,12 +391,10 @@ fn robots(first: Number, n_robots: Number) -> Range<u32> {
     first.0..first.0.saturating_add(n_robots.0)
 }
 
-/// Checks an instance's name.
 pub fn checked(py: Python<'_>, instance: &str) -> PyResult<Instance> {
     Instance::new(instance).map_err(|error| raise_of_channel(py, error))
 }
 
-/// Logs a warning as the package `emberwatch`.
 pub fn warn_in_log(py: Python<'_>, text: &str) -> PyResult<()> {
     let logger = py
         .import("logging")?

@@ -108,7 +108,6 @@ impl Flights {
         (slf.get_type(), arguments)
     }
 
-    /// Rows and columns, `[n_rows, 2]`.
     #[getter]
     fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<i64>>> {
         let cells = self.cells.iter();
@@ -146,8 +145,6 @@ impl Flights {
         PyArray1::from_vec(py, masks).reshape([self.cells.len(), Move::ALL.len()])
     }
 
-    /// Begins the paths of the rows marked in `begun`. `robots`, `[n_rows, 2]`, and the hidden `states`,
-    /// `[n_rows, H, W]`, cover all rows.
     fn start_paths(
         &mut self,
         py: Python<'_>,
@@ -177,7 +174,6 @@ impl Flights {
         Ok(())
     }
 
-    /// Returns whether the next move of each row is the last of its path.
     fn completes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
         PyArray1::from_iter(py, self.n_made.iter().map(|n| n + 1 == self.n_moves))
     }

@@ -72,7 +72,6 @@ impl Lease {
     ///         in one or more worlds. None: all robots of the lease.
     ///     full: Whether to observe every cell. Requires a server with coverage "client" or "full".
     ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
     ///
     /// Raises:
     ///     InvalidArgumentError: If the paths do not have this shape, type and range.
@@ -108,8 +107,7 @@ impl Lease {
     /// moved counts as having moved on without these paths.
     ///
     /// Args:
-    ///     paths: As in `step`.
-    ///     robots: As in `step`.
+    ///     paths, robots: As in `step`.
     ///     accepts_late: Whether to return the current results of a world that moved on without
     ///         these paths, instead of raising the error with code `"late"`.
     ///     timeout: Seconds to wait before each check whether the worlds have moved. The server's
@@ -153,8 +151,7 @@ impl Lease {
     ///
     /// Args:
     ///     robots: The numbers of consecutive robots; None: all robots of the lease.
-    ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
+    ///     team: As in `step`.
     #[pyo3(signature = (*, robots=None, team=false, timeout=5.0))]
     fn observe(
         &self,
@@ -178,7 +175,6 @@ impl Lease {
     ///     seeds: One seed for each world; None: the server derives each seed from the world's last
     ///         seed.
     ///     worlds: The worlds to reset; None: all worlds of the lease.
-    ///     timeout: Seconds to wait for the answer.
     ///
     /// Returns:
     ///     The state of each reset world, in the given order: a tuple of `WorldInfo`.
@@ -207,7 +203,6 @@ impl Lease {
     ///     path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
     ///     worlds: The consecutive worlds to replace; None: all worlds of the lease.
     ///     first: The number of the first world in the file to use; the next worlds follow.
-    ///     timeout: Seconds to wait for the answer.
     ///
     /// Returns:
     ///     The state of each restored world, a tuple of `WorldInfo`.
@@ -260,7 +255,6 @@ impl Lease {
     ///     kind: The format of the bytes, for other agents. At most 256 bytes.
     ///     data: At most 32,768 bytes plus 76 per cell; more if the model has over 18 states.
     ///     robot: The robot's number; None: the first robot of the lease.
-    ///     timeout: Seconds to wait for the answer.
     #[pyo3(signature = (result, kind, data, *, robot=None, timeout=5.0))]
     fn leave_belief(
         &self,
@@ -346,7 +340,6 @@ impl Lease {
         })
     }
 
-    /// Returns the chosen robots of the lease; by default all.
     fn part(&self, robots: Option<&Bound<'_, PyAny>>) -> PyResult<Range<u32>> {
         match robots {
             Some(robots) => range_of("robots", robots, &self.robots),
@@ -396,7 +389,6 @@ impl Lease {
         Ok(answer)
     }
 
-    /// Logs that a step waits for the paths of other robots.
     fn warn_of_wait(&self, py: Python<'_>, first_robot: u32) -> PyResult<()> {
         let world = worlds_of(first_robot, 1, self.client.get().server.n_robots).start;
         let text = format!(

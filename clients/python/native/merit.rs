@@ -8,10 +8,8 @@ use numpy::ndarray::{ArrayView1, ArrayView2, Axis};
 use numpy::{PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::prelude::*;
 
-/// The figures of a row of Python's benchmark, from `steps_to_detection` to `grid_seen_share`.
 type Figures = (Option<u64>, Option<u32>, Option<f64>, Option<f64>, f64);
 
-/// The running figures of merit of several worlds, which step together.
 #[pyclass(module = "emberwatch._native")]
 pub struct MeritTally(Vec<merit::MeritTally>);
 
@@ -54,7 +52,6 @@ impl MeritTally {
         }
     }
 
-    /// Returns the figures of one world over its steps so far.
     fn merit(&self, world: usize) -> Figures {
         let got = self.0[world].merit();
         (

@@ -1,5 +1,6 @@
 //! Model files and descriptions, read for Python's `Model` and `Description`.
 
+use crate::airspace;
 use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
 use emberwatch_model::hazards::Hazards;
@@ -12,8 +13,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use std::collections::BTreeMap;
 
-/// Returns the text of each built-in file of a kind, by name. Kinds: `"models"`, `"tasks"`, and `"states"`, which are
-/// descriptions of recorded states.
+/// Returns the texts of built-in files by name. `"states"` are descriptions of recorded states.
 #[pyfunction]
 pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &'static str>> {
     match kind {
@@ -24,7 +24,6 @@ pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &
     }
 }
 
-/// Parses the text of a model file, and returns the model's fields by name.
 #[pyfunction]
 pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = model_of(text)?;
@@ -52,19 +51,16 @@ pub fn with_radius(text: &str, radius: i64) -> PyResult<String> {
     toml::to_string(&file).map_err(refused)
 }
 
-/// Returns the fields of a description of recorded worlds, by name.
 #[pyfunction]
 pub fn read_description<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = Description::model_of(text).map_err(refused)?;
     described(py, &model)
 }
 
-/// Parses a model from the text of a model file.
 pub fn model_of(text: &str) -> PyResult<Model> {
     Model::from_toml(text).map_err(refused)
 }
 
-/// Returns the shape of a grid. Raises an error if a side is out of range.
 pub fn shape_of(py: Python<'_>, height: usize, width: usize) -> PyResult<Shape> {
     let expected = format!("height and width within 1 to {MAX_SIDE}");
     let got = format!("{height} x {width}");
@@ -94,18 +90,11 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
     )?;
     fields.set_item("observation_matrix", model.likelihood().to_pyarray(py))?;
     fields.set_item("reward", model.reward().to_pyarray(py))?;
-    fields.set_item("airspace", airspace(py, model)?)?;
-    Ok(fields)
-}
-
-/// Returns the fields of Python's `Airspace`.
-fn airspace<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>> {
-    let fields = PyDict::new(py);
-    fields.set_item("radius", model.radius())?;
-    let no_fly = model.file().no_fly.as_ref().map(CellMap::grid);
+    let no_fly = file.no_fly.as_ref().map(CellMap::grid);
     let no_fly = no_fly.map(|map| map.expect("invariant: a model's maps are checked"));
-    let no_fly = no_fly.map(|map| map.mapv(|flag| flag != 0).to_pyarray(py));
-    fields.set_item("no_fly", no_fly)?;
+    let no_fly = no_fly.map(|map| map.mapv(|flag| flag != 0));
+    let airspace = airspace::python(py, model.radius(), no_fly.as_ref())?;
+    fields.set_item("airspace", airspace)?;
     Ok(fields)
 }
 

@@ -25,11 +25,9 @@ pub struct Owned<T: Send> {
 /// Without value and thread, it is closed.
 struct Slot<T> {
     value: Option<T>,
-    /// The thread that is using the value.
     user: Option<ThreadId>,
 }
 
-/// The reason why a thread could not take the value.
 enum Untaken {
     /// A signal handler raised an exception during the wait.
     Interrupted,
@@ -38,7 +36,6 @@ enum Untaken {
 }
 
 impl<T> Slot<T> {
-    /// Takes the value for this thread, if it is free.
     fn take(&mut self) -> Option<T> {
         let value = self.value.take();
         if value.is_some() {
@@ -70,9 +67,6 @@ impl<T: Send> Owned<T> {
     }
 
     /// Uses the value with the interpreter lock released, so that other threads can run.
-    ///
-    /// # Errors
-    /// If the value is closed, if another process made it, or if the wait for other threads was interrupted.
     pub fn with<R: Send>(
         &self,
         py: Python<'_>,
@@ -112,9 +106,6 @@ impl<T: Send> Owned<T> {
     }
 
     /// Drops the value. Does nothing in another process, or if it is closed already.
-    ///
-    /// # Errors
-    /// If the wait for other threads was interrupted; the value is still open.
     pub fn close(&self, py: Python<'_>) -> PyResult<()> {
         if self.pid != pid() {
             return Ok(());
@@ -136,7 +127,6 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Refuses any process except the one that made the value.
     pub fn check(&self, py: Python<'_>) -> PyResult<()> {
         if self.pid == pid() {
             return Ok(());
@@ -151,7 +141,6 @@ impl<T: Send> Owned<T> {
         Err(error(py, "EmberwatchError", (text, "forked")))
     }
 
-    /// Returns the beginning of an error message: the subject, and its verb in the singular or plural.
     fn subject(&self, singular: &str, plural: &str) -> String {
         if self.instance == INSTANCE {
             format!("these worlds {plural}")
@@ -249,7 +238,6 @@ fn known_pid() -> u32 {
     }
 }
 
-/// Clears the cached process id in a forked child.
 pub fn forget_pid() {
     PID.store(0, Ordering::Relaxed);
 }

@@ -17,15 +17,12 @@ use emberwatch_model::Frame;
 use emberwatch_model::path::path_to_bytes;
 use numpy::ndarray::{Array3, ArrayView1, s};
 
-/// Beliefs and plans of many worlds.
 pub struct PlannedWorlds {
     pub setup: OptionSetup,
-    /// `None` before a world's first episode.
     worlds: Vec<Option<OptionAgent>>,
     threads: Pool,
 }
 
-/// A world, and the result and the frame of its step.
 type Seen<'a> = (&'a mut OptionAgent, &'a [u8], &'a [u8]);
 
 impl PlannedWorlds {
@@ -37,7 +34,6 @@ impl PlannedWorlds {
         }
     }
 
-    /// Returns the world with this number, if an episode has begun there.
     pub fn world(&mut self, world: usize) -> Option<&mut OptionAgent> {
         self.worlds.get_mut(world)?.as_mut()
     }
@@ -78,7 +74,7 @@ impl PlannedWorlds {
             .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Updates the belief about one world with an earlier step: its result and its frame, `[1, H, W]`.
+    /// `result` and `frame` are of an earlier step.
     pub fn recall(&mut self, world: usize, result: &[u8], frame: &[u8]) -> Result<()> {
         let Some(planned) = self.worlds.get_mut(world).and_then(Option::as_mut) else {
             return Ok(());
@@ -89,8 +85,8 @@ impl PlannedWorlds {
             .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Plans all options in the chosen worlds. Returns features `[n_worlds, options, features]` and paths
-    /// `[n_worlds, options, T]` of the last plans of all worlds.
+    /// Plans in the chosen worlds. Returns the last plans of all worlds: features `[n_worlds, options, features]` and
+    /// paths `[n_worlds, options, T]`.
     pub fn plan(&mut self, chosen: &[bool], results: &[u8]) -> (Array3<f32>, Array3<u8>) {
         let rows = results.chunks_exact(RESULT_BYTES).zip(chosen);
         let planning = self.worlds.iter_mut().zip(rows);
@@ -127,7 +123,6 @@ impl PlannedWorlds {
     }
 }
 
-/// Corrects and predicts the beliefs.
 fn update(setup: &OptionSetup, mut seen: Vec<Seen<'_>>, threads: Threads) -> Result<()> {
     let corrected = threads.each(&mut seen, |(planned, result, frame)| {
         let (world, robot) = parsed(result);

@@ -68,7 +68,6 @@ pub fn beam_search<'py>(
     Ok(paths.into_pyarray(py))
 }
 
-/// Checks that the beam's memory is within the limit and available.
 fn check(
     py: Python<'_>,
     shape: Shape,

@@ -11,7 +11,6 @@ use std::io::BufReader;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-/// An open recording.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Recording {
     name: String,
@@ -71,7 +70,6 @@ fn raise(py: Python<'_>, name: &str, problem: RecordingError) -> PyErr {
     error(py, "EmberwatchError", (text, code))
 }
 
-/// Creates the exception for a file that the system could not read.
 fn unread(name: &str, error: &std::io::Error) -> PyErr {
     match error.raw_os_error() {
         Some(code) => PyOSError::new_err((code, error.to_string(), name.to_owned())),

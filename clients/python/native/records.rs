@@ -1,6 +1,7 @@
 //! Makes the records of `emberwatch/client` (frozen dataclasses and named tuples in Python, which say what each field
 //! means) from replies, published samples and results.
 
+use crate::airspace;
 use crate::errors::bad_answer;
 use emberwatch_messages::agent_belief::AgentBelief;
 use emberwatch_messages::control::{ServerInfo, ServerStatus, WorldInfo};
@@ -11,7 +12,7 @@ use emberwatch_messages::message::{
 use emberwatch_messages::payload::{split_frame_payload, truth_states};
 use emberwatch_messages::sample::Sample;
 use emberwatch_model::Grid;
-use numpy::{IntoPyArray, PyArray1, PyArrayMethods, ToPyArray};
+use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::IntoPyObjectExt;
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyTuple};
@@ -56,15 +57,9 @@ pub fn server_info<'py>(py: Python<'py>, info: &ServerInfo) -> PyResult<Bound<'p
     let airspace = info
         .airspace()
         .map_err(|problem| bad_answer(py, &problem))?;
-    let land = PyDict::new(py);
-    land.set_item("radius", airspace.radius())?;
-    if let Some(no_fly) = airspace.no_fly() {
-        land.set_item("no_fly", no_fly.to_pyarray(py))?;
-    }
-    let airspace = py
-        .import("emberwatch.model.airspace")?
-        .getattr("Airspace")?;
-    fields.set_item("airspace", airspace.call((), Some(&land))?)?;
+    let no_fly = airspace.no_fly().map(|map| &**map);
+    let airspace = airspace::python(py, airspace.radius(), no_fly)?;
+    fields.set_item("airspace", airspace)?;
     if let Some(recorded) = &info.recorded_world {
         fields.set_item("recorded_world", record(py, "RecordedWorld", recorded)?)?;
     }
@@ -79,7 +74,6 @@ pub fn status<'py>(py: Python<'py>, status: &ServerStatus) -> PyResult<Bound<'py
     made(py, "ServerStatus", &fields)
 }
 
-/// Returns a tuple of `WorldInfo`.
 pub fn worlds<'py>(py: Python<'py>, worlds: &[WorldInfo]) -> PyResult<Bound<'py, PyTuple>> {
     let worlds: PyResult<Vec<_>> = worlds
         .iter()
@@ -129,7 +123,6 @@ pub fn truth<'py>(
     truth_from(py, (header.world, moment), states, n_lost)
 }
 
-/// Returns the hidden states of a world in this process.
 pub fn truth_of<'py>(
     py: Python<'py>,
     world: u32,
@@ -185,7 +178,6 @@ pub fn outlook<'py>(
     sample_of(py, "Outlook", &fields)
 }
 
-/// Makes a reply's record from its JSON keys.
 fn record<'py>(
     py: Python<'py>,
     class: &str,

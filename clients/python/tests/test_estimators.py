@@ -81,7 +81,7 @@ def made(kind: str, checkpoint: Path | None, n_worlds: int | None = None) -> Bel
 
 def of_agents(kind: str, checkpoint: Path | None, flown: Any) -> Iterator[NDArray[np.float32]]:
     """Yields the beliefs of agents with this estimator before each step, `(S, n, H, W)`."""
-    spec = types.SimpleNamespace(
+    spec: Any = types.SimpleNamespace(
         **GRID,
         n_moves=16,
         n_observations=MODEL.n_observations,

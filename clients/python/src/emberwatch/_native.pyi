@@ -4,9 +4,9 @@ Calls that wait release the interpreter lock, and Ctrl-C interrupts them. Open o
 process that made them: using one in a forked child raises an error with code `"forked"`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
-from typing import Any, Generic, Literal, Protocol, Self, TypeVar, final
+from typing import Any, Generic, Literal, Self, TypeVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,38 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from emberwatch.client.observer import Frame, Outlook, Truth
 from emberwatch.client.replies import LeftBelief, ServerInfo, ServerStatus, WorldInfo
 from emberwatch.client.wire import StepResult
+from emberwatch.envs.settings import WorldSpec
+from emberwatch.model.airspace import Airspace
 
 _Sample = TypeVar("_Sample")
 
 _Doubles = NDArray[np.float64]
-
-class _Airspace(Protocol):
-    @property
-    def radius(self) -> int: ...
-    @property
-    def no_fly(self) -> NDArray[np.bool_] | None: ...
-
-class _Text(Protocol):
-    @property
-    def toml(self) -> str: ...
-
-class _Spec(Protocol):
-    @property
-    def height(self) -> int: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def n_moves(self) -> int: ...
-    @property
-    def n_observations(self) -> int: ...
-    @property
-    def burn_in(self) -> int: ...
-    @property
-    def airspace(self) -> _Airspace: ...
-    @property
-    def model(self) -> _Text | None: ...
-    @property
-    def description(self) -> _Text | None: ...
 
 #: The default kind of belief where a model is known.
 RECOMMENDED: str
@@ -163,7 +137,6 @@ class Client:
     def belief(self, robot: int = 0, *, timeout: float = 5.0) -> LeftBelief | None: ...
     def status(self, *, timeout: float = 5.0) -> ServerStatus: ...
     def shutdown(self, *, timeout: float = 5.0) -> None: ...
-    def control(self, request: Mapping[str, Any], *, timeout: float) -> dict[str, Any]: ...
     def truths(self, worlds: range) -> list[Truth]: ...
     def clone_state(self) -> bytes: ...
     def restore_state(self, worlds: bytes) -> None: ...
@@ -266,7 +239,7 @@ def columns(results: NDArray[np.uint8], pays: int) -> _Columns: ...
 class Options:
     def __new__(
         cls,
-        spec: _Spec,
+        spec: WorldSpec,
         n_worlds: int,
         estimator: str | None,
         checkpoint: tuple[str, bytes] | None,
@@ -295,7 +268,7 @@ class Flights:
         width: int,
         n_moves: int,
         reward: list[float] | None,
-        airspace: _Airspace | None = None,
+        airspace: Airspace | None = None,
         windows: list[tuple[int, int]] = ...,
     ) -> Flights: ...
     @property
@@ -386,7 +359,7 @@ def beam_search(
     keys: NDArray[np.uint64],
     n_moves: int,
     width: int,
-    airspace: _Airspace | None = None,
+    airspace: Airspace | None = None,
 ) -> NDArray[np.uint8]: ...
 
 @final

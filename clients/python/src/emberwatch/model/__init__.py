@@ -57,9 +57,7 @@ class Description:
         """Parses the text of a file that has been checked."""
         text = text.removeprefix(BYTE_ORDER_MARK)
         try:
-            values = cls._read(text)
-            values["airspace"] = Airspace(**values["airspace"])
-            return cls(**values, toml=text)
+            return cls(**cls._read(text), toml=text)
         except (TypeError, ValueError) as error:
             expected = "a file that `emberwatch-server --check` accepts"
             raise invalid(cls.__name__.lower(), expected, error) from None
