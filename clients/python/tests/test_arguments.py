@@ -70,17 +70,11 @@ ENVIRONMENTS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Any]] = {
 
 #: Wrong actions by kind of environment, each with a pattern of its error.
 WRONG: dict[str, list[tuple[Any, str]]] = {
-    "path": [
-        ([0, 1, 2], r"expected shape \(1, 4\) or \(4,\), got \(3,\)"),
-        ([0, 1, 2, 4], r"expected moves 0 to 3, got 4 at \(3,\)"),
-        ([0.0, 1.0, 2.0, 3.0], "expected integers, got float64"),
-    ],
     "move": [
         (4, "expected one integer, 0 to 3, got 4"),
         *((it, f"got {it!r}") for it in (-1, 1.0, True, None, "0")),
         ([[0], [1, 2]], "got list: "),
     ],
-    "paths": [(np.zeros((3, 4), int), r"expected shape \(2, 4\), got \(3, 4\)")],
     "moves": [
         ([0], r"integers of shape \(2,\), got int64 \(1,\)"),
         ([-1, 0], "expected 0 to 3, got -1 for world 0"),
@@ -119,16 +113,6 @@ def test_invalid_seeds_are_refused_everywhere() -> None:
         for seed in (*no_seeds, np.ma.array([5, 6], mask=[True, False]), Elsewhere(ELSEWHERE[0])):
             with refuses("seed: expected (an integer|integers)"):
                 env.reset(seed=seed)
-
-
-def test_a_lease_takes_one_seed_per_world() -> None:
-    env = make_vec(2)
-    env.reset(seed=1)
-    lease = env._session._lease
-    for seeds in (5, np.array(5)):
-        with refuses("seeds: expected one for each world, got"):
-            lease.reset(seeds)
-    assert [world.seed for world in lease.reset(np.array([5, 6]))] == [5, 6]
 
 
 #: Wrong arguments of `reset`, with error patterns: of any environment, and of a vector.

@@ -1,4 +1,4 @@
-"""Calls that wait: timeouts, closing, forks and Ctrl-C."""
+"""Calls that wait: timeouts, closing and Ctrl-C."""
 
 import os
 import signal
@@ -6,7 +6,7 @@ import threading
 
 import pytest
 from failures import fails, refuses
-from processes import LONG, PATIENCE, asleep, ctrl_c, eventually, script, server
+from processes import LONG, PATIENCE, asleep, ctrl_c, eventually, server
 
 from emberwatch import errors
 from emberwatch.client.client import connect
@@ -106,44 +106,6 @@ def test_closing_twice_is_allowed_and_closed_clients_refuse() -> None:
     for call in (*calls, lease.observe, lease.reset, lease.renew, lease.release):
         with fails("closed", match="closed"):
             call()
-
-
-FORK = """
-import multiprocessing, os, sys
-from emberwatch.client.client import Client
-from emberwatch.errors import EmberwatchError
-from emberwatch.client.observer import observe
-
-client = Client(sys.argv[1])
-lease, observer = client.acquire(), observe(sys.argv[1], timeout=0)
-lease.step([3] * 6)
-
-def child():
-    for call in (client.status, client.observe, lease.release, lambda: lease.step([3] * 6),
-                 lambda: observer.receive(0)):
-        try:
-            call()
-        except EmberwatchError as error:
-            assert error.code == "forked" and "open a new one" in str(error)
-        else:
-            os._exit(9)
-    client.close()
-    observer.close()
-    with Client(sys.argv[1]) as own:
-        assert own.observe().result().world.step == 1
-
-process = multiprocessing.get_context("fork").Process(target=child)
-process.start()
-process.join()
-assert lease.step([3] * 6).result().world.step == 2
-assert observer.receive(5) is not None
-print("child", process.exitcode)
-"""
-
-
-def test_a_forked_child_is_refused_and_its_parent_continues() -> None:
-    ended, out, err = script(FORK, server().instance).end()
-    assert (ended, out) == (0, "child 0\n"), err
 
 
 def test_ctrl_c_ends_a_blocked_step_but_not_the_client() -> None:
