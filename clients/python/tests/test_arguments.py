@@ -182,7 +182,6 @@ def test_a_spec_survives_json() -> None:
 GIVEN_LONG: dict[str, Callable[[Any], object]] = {
     "model": lambda long: make(model=long),
     "toml": lambda long: make(model=f"\n{long} = 1"),
-    "start": lambda long: make(start=long),
     "observation": lambda long: make(observation=long),
     "instance": lambda long: make(instance=long, timeout=0.01),
     "options": lambda long: make().reset(options={long: True}),
@@ -190,7 +189,6 @@ GIVEN_LONG: dict[str, Callable[[Any], object]] = {
     "kind": lambda long: belief.load("no", height=4, width=4, kind=long),
     "policy": lambda long: evaluate(lambda seen: seen, name="mine", env=long),
     "length": lambda long: make_vec(2, max_episode_steps=long),
-    "baseline": lambda long: make(OBJECTIVE, estimator=long),
     "tasks": lambda long: suite(lambda seen: seen, name="a", folder="no", tasks=["small"] * 900),
 }
 

@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+from functools import partial
 
 import pytest
 from failures import fails, refuses
@@ -18,31 +19,19 @@ def test_every_call_has_a_timeout() -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()
+    requests = lease.observe, client.status, lease.reset, lease.renew, client.acquire
     started.stop()
-    for call in (
-        lambda: lease.step([3] * 6, timeout=0.05),
-        lambda: lease.observe(timeout=0.05),
-        lambda: client.status(timeout=0.05),
-        lambda: lease.reset(timeout=0.05),
-        lambda: lease.renew(timeout=0.05),
-        lambda: client.acquire(timeout=0.05),
-        lambda: lease.release(timeout=0.05),
-    ):
-        with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.05 s") as raised:
-            call()
-        assert started.instance in str(raised.value)
+    for call in (partial(lease.step, [3] * 6), *requests, lease.release):
+        with pytest.raises(errors.RequestTimeoutError, match=rf"{started.instance}.* 0\.05 s"):
+            call(timeout=0.05)
     # Longer, because connecting also waits for other tests that hold the lock of all channels.
-    with pytest.raises(errors.RequestTimeoutError, match=r"within 3\.0 s") as raised:
+    with pytest.raises(errors.RequestTimeoutError, match=rf"{started.instance}.* within 3\.0 s"):
         connect(started.instance, timeout=3)
-    assert started.instance in str(raised.value)
-    started.wake_up()
-    assert client.observe().result().world.step == 0
-    started.stop()
     with pytest.raises(errors.RequestTimeoutError):
         client.observe(timeout=0)
     started.wake_up()
     for timeout in (-1, float("nan"), -float("inf")):
-        for call in (client.observe, client.status, lease.renew, lease.reset, client.acquire):
+        for call in requests:
             with refuses("timeout: expected seconds of at least 0"):
                 call(timeout=timeout)
     assert client.observe(timeout=float("inf")).result().world.step == 0

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import CHANNELS, LONG, Server, asleep, eventually, script, server, services
+from processes import CHANNELS, LONG, asleep, eventually, script, server, services
 
 from emberwatch import errors
 from emberwatch.client.client import connect
