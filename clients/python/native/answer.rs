@@ -109,21 +109,10 @@ impl StepAnswer {
     }
 
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
-        let Self {
-            first_robot,
-            simulation_nanos,
-            dim,
-            ..
-        } = self;
-        let [n_frames, height, width] = dim;
         let first = self.result(py, 0)?.repr()?;
-        let more = match self.n_robots - 1 {
-            0 => String::new(),
-            others => format!(", and {others} more"),
-        };
         Ok(format!(
-            "StepAnswer(first_robot={first_robot}, simulation_nanos={simulation_nanos}, \
-             frames=<uint8 ({n_frames}, {height}, {width})>, results=[{first}{more}])"
+            "<StepAnswer of {} robots: {first}, ...>",
+            self.n_robots
         ))
     }
 

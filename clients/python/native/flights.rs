@@ -14,7 +14,6 @@ use numpy::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::PyType;
 
 type Arguments = (
     usize,
@@ -96,16 +95,14 @@ impl Flights {
         })
     }
 
-    /// Returns the class and its arguments, for copies and pickles. A copy starts without paths.
-    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> (Bound<'py, PyType>, Arguments) {
-        let this = slf.borrow();
-        let (height, width) = this.shape.dim();
-        let reward = this.reward.clone();
-        let given = this.given.as_ref().map(|it| it.clone_ref(slf.py()));
-        let windows = this.windows.iter().map(Windows::dim).collect();
-        let n_rows = this.cells.len();
-        let arguments = (n_rows, height, width, this.n_moves, reward, given, windows);
-        (slf.get_type(), arguments)
+    /// Returns the constructor's arguments, for copies and pickles, which start without paths.
+    fn __getnewargs__(&self, py: Python<'_>) -> Arguments {
+        let (height, width) = self.shape.dim();
+        let reward = self.reward.clone();
+        let given = self.given.as_ref().map(|it| it.clone_ref(py));
+        let windows = self.windows.iter().map(Windows::dim).collect();
+        let n_rows = self.cells.len();
+        (n_rows, height, width, self.n_moves, reward, given, windows)
     }
 
     #[getter]

@@ -26,7 +26,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 ///
 /// Attributes:
 ///     client: The `Client` that acquired it.
-///     number: The lease's number on the server.
 ///     ttl: Seconds without use after which the lease expires.
 ///     robots: The numbers of its robots, a range.
 ///     worlds: The worlds of these robots, a range.
@@ -46,11 +45,6 @@ pub struct Lease {
 
 #[pymethods]
 impl Lease {
-    #[getter]
-    fn number(&self) -> u64 {
-        self.lease.number()
-    }
-
     #[getter]
     fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyRange>> {
         python_range(py, &self.robots)
@@ -319,7 +313,7 @@ impl Lease {
 
     fn __repr__(&self) -> String {
         let Range { start, end } = self.robots;
-        format!("<Lease {} of robots {start} to {}>", self.number(), end - 1)
+        format!("<Lease of robots {start} to {}>", end - 1)
     }
 }
 

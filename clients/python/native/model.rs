@@ -5,7 +5,7 @@ use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
 use emberwatch_model::hazards::Hazards;
 use emberwatch_model::task::Task;
-use emberwatch_model::{CellMap, Description, Model, parse_color};
+use emberwatch_model::{CellMap, Description, Model};
 use emberwatch_sim::states_file::StatesFile;
 use numpy::ToPyArray;
 use pyo3::exceptions::PyValueError;
@@ -79,15 +79,12 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
     fields.set_item("name", model.name())?;
     let names: Vec<_> = states.clone().map(|it| &it.name).collect();
     fields.set_item("state_names", PyTuple::new(py, names)?)?;
-    fields.set_item("state_colors", colors(py, states.map(|it| &it.color))?)?;
-    fields.set_item(
-        "observation_names",
-        PyTuple::new(py, model.observation_names())?,
-    )?;
-    fields.set_item(
-        "observation_colors",
-        colors(py, observations.map(|it| &it.color))?,
-    )?;
+    let colors: Vec<_> = states.map(|it| &it.color).collect();
+    fields.set_item("state_colors", colors)?;
+    let names = PyTuple::new(py, model.observation_names())?;
+    fields.set_item("observation_names", names)?;
+    let colors: Vec<_> = observations.map(|it| &it.color).collect();
+    fields.set_item("observation_colors", colors)?;
     fields.set_item("observation_matrix", model.likelihood().to_pyarray(py))?;
     fields.set_item("reward", model.reward().to_pyarray(py))?;
     let no_fly = file.no_fly.as_ref().map(CellMap::grid);
@@ -96,16 +93,4 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
     let airspace = airspace::python(py, model.radius(), no_fly.as_ref())?;
     fields.set_item("airspace", airspace)?;
     Ok(fields)
-}
-
-fn colors<'a, 'py>(
-    py: Python<'py>,
-    of: impl Iterator<Item = &'a String>,
-) -> PyResult<Bound<'py, PyTuple>> {
-    let color = |text: &String| {
-        let [red, green, blue] =
-            parse_color(text).expect("invariant: a model's colours are checked");
-        (red, green, blue)
-    };
-    PyTuple::new(py, of.map(color).collect::<Vec<_>>())
 }

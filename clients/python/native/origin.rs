@@ -33,19 +33,13 @@ pub struct Origin {
     pub shape: Shape,
 }
 
-type Facts = (&'static str, bool, bool, bool);
-
 #[pyfunction]
-pub fn belief_kinds() -> Vec<(&'static str, Facts)> {
+pub fn belief_kinds() -> Vec<(&'static str, (&'static str, bool, bool, bool))> {
     let facts = |it: &BeliefKind| {
-        (
-            it.about,
-            it.knows_model,
-            it.learned_by.is_some(),
-            it.has_options,
-        )
+        let is_learned = it.learned_by.is_some();
+        (it.about, it.knows_model, is_learned, it.has_options)
     };
-    of_frames().map(|kind| (kind.name, facts(kind))).collect()
+    of_frames().map(|it| (it.name, facts(it))).collect()
 }
 
 impl Origin {

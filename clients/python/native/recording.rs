@@ -35,9 +35,12 @@ impl Recording {
         })
     }
 
-    /// Returns the next record's nanoseconds since the recording began and its `Frame`, `Truth` or
-    /// `ServerInfo`; None at the end.
-    fn read<'py>(&self, py: Python<'py>) -> PyResult<Option<(u64, Bound<'py, PyAny>)>> {
+    fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    /// Returns nanoseconds since the recording began, and a `Frame`, `Truth` or `ServerInfo`.
+    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<(u64, Bound<'py, PyAny>)>> {
         let record = py.detach(|| {
             let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
             reader.next()

@@ -71,7 +71,7 @@ def test_a_recording_is_read_in_order_with_lost_samples(path: Path) -> None:
 def test_recordings_of_version_2_are_read_unless_their_sensor_has_rings(path: Path) -> None:
     server = read(path, GOOD, strict=True)[0].server
     assert server.airspace == Airspace(radius=1) and server.protocol == 2
-    assert server.model is not None and Model.from_toml(server.model).sensor_radius == 1
+    assert server.model is not None and Model.from_toml(server.model).airspace.radius == 1
     header, first, *rest = parts()
     info = json.loads(zlib.decompress(first[24:], -15))
     for change in ({"n_rings": 2}, {"pays": "seen"}):

@@ -57,7 +57,10 @@ class Description:
         """Parses the text of a file that has been checked."""
         text = text.removeprefix(BYTE_ORDER_MARK)
         try:
-            return cls(**cls._read(text), toml=text)
+            values = cls._read(text)
+            for colors in ("state_colors", "observation_colors"):
+                values[colors] = tuple(map(color_from_hex, values[colors]))
+            return cls(**values, toml=text)
         except (TypeError, ValueError) as error:
             expected = "a file that `emberwatch-server --check` accepts"
             raise invalid(cls.__name__.lower(), expected, error) from None
@@ -68,16 +71,6 @@ class Description:
         if radius == self.airspace.radius:
             return self
         return self.from_toml(_native.with_radius(self.toml, radius))
-
-    @property
-    def sensor_radius(self) -> int:
-        """Number of rows and columns that robots see beyond each cell of their path."""
-        return self.airspace.radius
-
-    @property
-    def no_fly(self) -> NDArray[np.bool_] | None:
-        """True in the no-fly cells, shape (H, W); None if there are none."""
-        return self.airspace.no_fly
 
     @property
     def n_states(self) -> int:
