@@ -183,15 +183,12 @@ impl Client {
         self.look(py, place, bytemuck::cast_slice(&body), timeout)
     }
 
-    /// Writes worlds to a file on the server's host, for `Lease.restore`. Needs no lease.
+    /// Writes worlds to a file on the server's host, for `Lease.restore`, and returns their states.
     ///
     /// Args:
     ///     path: The file. A relative path starts at this process's working directory.
     ///     first_world: The first world to write.
     ///     n_worlds: Number of worlds; None: all worlds from `first_world` on.
-    ///
-    /// Returns:
-    ///     The state of each world in the file, a tuple of `WorldInfo`.
     #[pyo3(text_signature = "($self, path, first_world=0, n_worlds=None, *, timeout=600.0)")]
     #[pyo3(signature = (path, first_world=Number(0), n_worlds=None, *, timeout=600.0))]
     fn snapshot<'py>(
@@ -247,10 +244,7 @@ impl Client {
         stopped.map(drop)
     }
 
-    /// Returns the hidden states of worlds in this process, one `Truth` for each world.
-    ///
-    /// Raises:
-    ///     InvalidArgumentError: Unless these worlds are in this process, with `publish_truth`.
+    /// Returns the hidden states of worlds in this process with `publish_truth`, one `Truth` each.
     fn truths<'py>(
         &self,
         py: Python<'py>,
@@ -265,9 +259,6 @@ impl Client {
     }
 
     /// Returns the state of all worlds in this process, as bytes of a snapshot.
-    ///
-    /// Raises:
-    ///     InvalidArgumentError: If the worlds are on a server; see `snapshot`.
     fn clone_state(&self, py: Python<'_>) -> PyResult<Cow<'static, [u8]>> {
         let clone = |backend: &mut dyn Backend| backend.clone_state();
         self.ask(py, "clone_state", 0.0, clone).map(Cow::from)
@@ -275,11 +266,8 @@ impl Client {
 
     /// Replaces all worlds in this process with the worlds that `clone_state` returned.
     ///
-    /// Then call `Lease.observe`: the next paths start from the steps that it returns.
-    ///
-    /// Raises:
-    ///     InvalidArgumentError: If the bytes are damaged or of other worlds, or the worlds are on
-    ///         a server. No world has changed then.
+    /// Then call `Lease.observe`: the next paths start from the steps that it returns. If the bytes
+    /// are damaged or of other worlds, no world changes.
     fn restore_state(&self, py: Python<'_>, worlds: Cow<'_, [u8]>) -> PyResult<()> {
         let restore = |backend: &mut dyn Backend| backend.restore_state(&worlds);
         self.ask(py, "restore_state", 0.0, restore)

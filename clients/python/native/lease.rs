@@ -68,10 +68,8 @@ impl Lease {
     ///     team: Whether to return one frame for each world's team instead of one for each robot.
     ///
     /// Raises:
-    ///     InvalidArgumentError: If the paths do not have this shape, type and range.
     ///     LeaseLostError: If the lease expired or a robot was taken over.
     ///     RequestTimeoutError: If no answer arrives; `observe` shows whether the step was made.
-    ///     ServerGoneError: If the server ended.
     ///     EmberwatchError: With code `"late"` if the world moved on without this path; `observe`
     ///         shows to which step. With code `"episode_over"` if the episode has ended: reset that
     ///         world.
@@ -163,15 +161,12 @@ impl Lease {
 
     /// Begins new episodes: burn-in, then k = 0, robots at their start cells, empty frames.
     ///
-    /// No other client may hold robots of these worlds.
+    /// No other client may hold robots of these worlds. Returns the state of each, in the given order.
     ///
     /// Args:
     ///     seeds: One seed for each world; None: the server derives each seed from the world's last
     ///         seed.
     ///     worlds: The worlds to reset; None: all worlds of the lease.
-    ///
-    /// Returns:
-    ///     The state of each reset world, in the given order: a tuple of `WorldInfo`.
     #[pyo3(signature = (seeds=None, *, worlds=None, timeout=600.0))]
     fn reset<'py>(
         &self,
@@ -189,7 +184,7 @@ impl Lease {
         })
     }
 
-    /// Replaces worlds of the lease with worlds from a snapshot file.
+    /// Replaces worlds of the lease with worlds from a snapshot file, and returns their states.
     ///
     /// The restored worlds continue exactly as the saved ones would have.
     ///
@@ -197,9 +192,6 @@ impl Lease {
     ///     path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
     ///     worlds: The consecutive worlds to replace; None: all worlds of the lease.
     ///     first: The number of the first world in the file to use; the next worlds follow.
-    ///
-    /// Returns:
-    ///     The state of each restored world, a tuple of `WorldInfo`.
     #[pyo3(signature = (path, *, worlds=None, first=Number(0), timeout=600.0))]
     #[pyo3(text_signature = "($self, path, *, worlds=None, first=0, timeout=600.0)")]
     fn restore<'py>(
@@ -222,12 +214,9 @@ impl Lease {
         })
     }
 
-    /// Replaces the lease's world `target` with a copy of the world `source`.
+    /// Replaces the lease's world `target` with a copy of the world `source`; returns its state.
     ///
     /// With the same actions, both worlds have the same future.
-    ///
-    /// Returns:
-    ///     The state of the world `target`, a tuple of one `WorldInfo`.
     #[pyo3(signature = (source, target, *, timeout=5.0))]
     fn fork<'py>(
         &self,

@@ -141,11 +141,7 @@ pub fn model_text(py: Python<'_>, name: String) -> PyResult<String> {
     model
         .check_on(shape)
         .map_err(|problem| refused(py, problem))?;
-    Ok(text_of(&model))
-}
-
-fn text_of(model: &Model) -> String {
-    toml::to_string(model.file()).expect("invariant: a model was read from TOML")
+    Ok(toml::to_string(model.file()).expect("invariant: a model was read from TOML"))
 }
 
 fn unread(py: Python<'_>, problem: ReadError) -> PyErr {

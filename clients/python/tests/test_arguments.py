@@ -106,18 +106,14 @@ def test_seeds_of_any_library_are_equivalent() -> None:
         assert_same(make_vec(1).reset(seed=[seed])[0]["frame"], expected[0]["frame"][np.newaxis])
 
 
-def test_invalid_seeds_are_refused_everywhere() -> None:
-    team = closed_later(emberwatch.parallel_env(robots=2, **SMALL))
-    no_seeds = 5.0, np.array(5.0), np.array([5.0, 6.0]), "ab", np.ma.array(5, mask=True), {5, 6}
-    for env in (make(), make(MOVES), make_vec(2), team):
-        for seed in (*no_seeds, np.ma.array([5, 6], mask=[True, False]), Elsewhere(ELSEWHERE[0])):
-            with refuses("seed: expected (an integer|integers)"):
-                env.reset(seed=seed)
-
-
 #: Wrong arguments of `reset`, with error patterns: of any environment, and of a vector.
 WRONG_RESETS: list[tuple[dict[str, Any], str]] = [
     *(({"seed": it}, rf"seed: expected an integer.*, got {it}") for it in (-1, 2**64)),
+    *(
+        ({"seed": it}, "seed: expected (an integer|integers)")
+        for it in (5.0, np.array([5.0, 6.0]), "ab", {5, 6}, Elsewhere(ELSEWHERE[0]))
+    ),
+    *(({"seed": np.ma.array(it, mask=True)}, "seed: expected") for it in (5, [5, 6])),
     *(
         ({"options": it}, r"options: expected a dictionary such as \{'resume': True\}, or None, ")
         for it in ("resume", 5, {"resume"}, Elsewhere(ELSEWHERE[0]))

@@ -1,6 +1,5 @@
 """Arguments of the Rust module: refusals instead of panics, Ctrl-C, and concurrent threads."""
 
-import os
 import signal
 import threading
 from collections.abc import Callable
@@ -9,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from failures import fails, refuses
-from processes import LONG, asleep, eventually, script, server
+from processes import LONG, asleep, ctrl_c, eventually, script, server
 
 from emberwatch import _native, errors
 from emberwatch.belief import known, uniform_prior
@@ -43,18 +42,9 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
     steps = threading.Thread(target=lambda: lease.step([3] * 6, timeout=LONG))
     steps.start()
     asleep(steps)
-
-    def interrupt() -> None:
-        asleep()
-        os.kill(os.getpid(), signal.SIGINT)
-        asleep()
-        started.wake_up()  # Ends `close` if the interrupt did not.
-
-    thread = threading.Thread(target=interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        thread.start()
+    with ctrl_c():
         client.close()
-    thread.join()
+    started.wake_up()
     steps.join()
     assert client.status().pid == started.program.pid
     client.close()
