@@ -74,7 +74,6 @@ pub fn range_of(what: &str, given: &Bound<'_, PyAny>, whole: &Range<u32>) -> PyR
     })
 }
 
-/// Returns an absolute path as text; refuses paths that are not UTF-8.
 pub fn absolute_path(path: &Bound<'_, PyAny>) -> PyResult<String> {
     let py = path.py();
     let absolute = py.import("os.path")?.call_method1("abspath", (path,))?;

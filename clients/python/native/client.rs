@@ -34,10 +34,8 @@ const NAME: &str = concat!("emberwatch-python ", env!("CARGO_PKG_VERSION"));
 /// Close it after use, or use it as a context manager. Threads may share it: their requests run
 /// one after another. Every call waits at most `timeout` seconds for its answer.
 ///
-/// Args:
-///     instance: The server's instance name.
-///     timeout: Seconds to wait for the server's answer.
-///     wait: Seconds to wait for a server that is still starting; 0: fail at once.
+/// `instance` is the server's name, `timeout` the time in seconds to wait for its answer, and `wait`
+/// the time to wait for a server that is still starting.
 ///
 /// Attributes:
 ///     info: A `ServerInfo`, the server's description of itself and its worlds.

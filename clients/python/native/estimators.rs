@@ -151,7 +151,6 @@ impl Estimators {
         Ok((!state.is_unfinished).then(|| state.steps.clone()))
     }
 
-    /// Draws each cell's state from its own distribution, `[n, H, W]`.
     fn sample<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<Bound<'py, PyArray3<u8>>> {
         if self.origin.kind.is_of_observations {
             let got = format!("'{}', which predicts observations", self.kind);
@@ -310,7 +309,6 @@ impl Estimators {
 }
 
 impl Estimators {
-    /// Builds the beliefs before the first frame. `n_worlds` is `None` for a single world without an axis for worlds.
     fn new(py: Python<'_>, origin: Arc<Origin>, n_worlds: Option<usize>) -> PyResult<Self> {
         let (is_single, n_worlds) = (n_worlds.is_none(), n_worlds.unwrap_or(1));
         let kind = origin.kind;

@@ -33,8 +33,11 @@ pub struct Origin {
     pub shape: Shape,
 }
 
+/// The fields of Python's `Kind`.
+type Facts = (&'static str, bool, bool, bool);
+
 #[pyfunction]
-pub fn belief_kinds() -> Vec<(&'static str, (&'static str, bool, bool, bool))> {
+pub fn belief_kinds() -> Vec<(&'static str, Facts)> {
     let facts = |it: &BeliefKind| {
         let is_learned = it.learned_by.is_some();
         (it.about, it.knows_model, is_learned, it.has_options)

@@ -105,10 +105,8 @@ reader! {
     /// The server publishes the current frame of every world when an observer connects, so the same
     /// step of the same episode may arrive twice.
     ///
-    /// Args:
-    ///     instance: The instance's name. Its server may start later.
-    ///     world: The only world to observe; None: all worlds.
-    ///     timeout: Seconds without a frame after which the iteration ends; None: it never ends.
+    /// The server of the instance may start later. `world` is the only world to observe; None: all.
+    /// The iteration ends after `timeout` seconds without a frame; None: never.
     Observer, FrameHeader, Subscriber::frames, records::frame
 }
 

@@ -19,7 +19,6 @@ use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyTuple};
 use serde::Serialize;
 use serde_json::Value;
 
-/// Returns an array of bytes as an array of results; `dtype` is a name in `emberwatch/client/wire.py`.
 pub fn view<'py>(bytes: &Bound<'py, PyArray1<u8>>, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
     bytes.call_method1("view", (of(bytes.py(), "wire", dtype)?,))
 }
@@ -41,7 +40,6 @@ fn robot_result<'py>(py: Python<'py>, it: &RobotResult) -> PyResult<Bound<'py, P
     unpacked(py, "RobotResult", "ROBOT", bytemuck::bytes_of(it))
 }
 
-/// Makes a named tuple from its bytes; `layout` is a name in `emberwatch/client/wire.py`.
 fn unpacked<'py>(
     py: Python<'py>,
     class: &str,
@@ -202,7 +200,6 @@ fn sample_of<'py>(
     of(py, "observer", class)?.call((), Some(fields))
 }
 
-/// Returns what a module of `emberwatch/client` calls `name`.
 pub fn of<'py>(py: Python<'py>, module: &str, name: &str) -> PyResult<Bound<'py, PyAny>> {
     py.import("emberwatch.client")?
         .getattr(module)?

@@ -17,7 +17,6 @@ use std::ops::Range;
 /// Settings of worlds in this process, with the files that they name, which are read only here.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct CheckedSettings {
-    /// The given settings as JSON.
     given: String,
     checked: Checked,
 }

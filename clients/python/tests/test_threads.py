@@ -75,15 +75,6 @@ def test_forked_children_open_their_own_connections() -> None:
     assert (ended, out) == (0, "{0} []\n"), err
 
 
-def test_a_wait_releases_the_interpreter_lock() -> None:
-    started = server(robots=2)
-    lease, mate = started.connect().acquire(0), started.connect().acquire(1)
-    waits = threading.Thread(target=lambda: lease.step([3] * 6))
-    waits.start()
-    mate.step([3] * 6)  # The other thread waits for this step.
-    waits.join()
-
-
 def test_open_objects_cannot_be_copied() -> None:
     client = server().connect()
     for copied in (pickle.dumps, copy.deepcopy):
