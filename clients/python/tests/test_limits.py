@@ -154,11 +154,15 @@ tell(make)
 
 
 def test_a_cgroups_limit_on_threads_is_named() -> None:
+    flags = [f"--instance={unused_instance()}", "--threads=16", "--burn-in=0"]
     with cgroup("pids", ["pids.max"], "6") as (outer, enter):
+        ended = run(find("emberwatch-server"), *flags, limit=enter)
         said = python("tell(lambda: emberwatch.embed(threads=16, worlds=16))", limit=enter)
-    assert "threads: expected to start 16, got: Resource temporarily" in said, said
-    assert said.count("Resource temporarily unavailable") == 1, said
-    assert f"({outer}/pids.max)" in said and "--pids-limit" in said, said
+    assert ended.returncode == 1, ended
+    assert "threads: expected to start 16, got: Resource temporarily" in ended.stderr, ended
+    assert ended.stderr.count("Resource temporarily unavailable") == 1, ended
+    assert f"({outer}/pids.max)" in ended.stderr and "--pids-limit" in ended.stderr, ended
+    assert f"({outer}/pids.max)" in said, said
 
 
 @on_x86
