@@ -1,11 +1,25 @@
 //! The airspace of a grid, built from Python's `Airspace`: where robots may fly, and what they see.
 
 use crate::refusal::invalid;
-use emberwatch_model::{Airspace, Shape};
+use emberwatch_model::{Airspace, Grid, Shape};
 use emberwatch_model::{CellMap, DescribedState, Description, ObservationEntry, SensorEntry};
-use numpy::PyReadonlyArray2;
+use numpy::{PyReadonlyArray2, ToPyArray};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 use std::sync::Arc;
+
+/// Makes Python's `Airspace`.
+pub fn python<'py>(
+    py: Python<'py>,
+    radius: usize,
+    no_fly: Option<&Grid<bool>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let fields = PyDict::new(py);
+    fields.set_item("radius", radius)?;
+    fields.set_item("no_fly", no_fly.map(|map| map.to_pyarray(py)))?;
+    let module = py.import("emberwatch.model.airspace")?;
+    module.getattr("Airspace")?.call((), Some(&fields))
+}
 
 /// The attributes of Python's `Airspace`.
 #[derive(FromPyObject)]
@@ -15,7 +29,6 @@ pub struct Given<'py> {
 }
 
 impl Given<'_> {
-    /// Builds the airspace of a grid. The no-fly map must have the grid's shape.
     pub fn on_grid(&self, py: Python<'_>, shape: Shape) -> PyResult<Airspace> {
         let no_fly = self.no_fly.as_ref().map(|map| map.as_array().to_owned());
         let dim = no_fly.as_ref().map_or(shape.dim(), |map| map.dim());

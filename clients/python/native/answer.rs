@@ -7,29 +7,19 @@ use emberwatch_messages::message::{
 };
 use emberwatch_messages::payload::{ROBOT_BYTES, WORLD_BYTES};
 use emberwatch_model::Shape;
-use emberwatch_model::grid::MAX_SIDE;
 use numpy::ndarray::arr2;
-use numpy::{
-    PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyUntypedArrayMethods,
-};
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::PySlice;
 use std::ops::Range;
 
-/// Total size of one world's result and one robot's result, in bytes.
 pub const RESULT_BYTES: usize = WORLD_BYTES + ROBOT_BYTES;
-
-/// Maximum number of robots in an answer: the number of all robots of the largest server.
-const MAX_ROBOTS: u32 = 1 << 16;
-
-type Arguments = (u32, usize, usize, u32, u32, u32, u64, Py<PyArray1<u8>>);
 
 /// Results of one robot's step: reward, terminated, truncated, step, number of distinct cells visited, and the robot's
 /// row and column as `[1, 2]`.
 type Numbers<'py> = (f64, bool, bool, u64, u32, Bound<'py, PyArray2<i64>>);
 
-/// Results of many robots' steps, one array per column; `_native.pyi` documents the columns.
 type Columns<'py> = (
     Bound<'py, PyArray1<f64>>,
     Bound<'py, PyArray1<bool>>,
@@ -54,7 +44,6 @@ type Columns<'py> = (
 ///     world_of: The index in `worlds` of each robot's world, `(n_robots,)`.
 #[pyclass(frozen, module = "emberwatch")]
 pub struct StepAnswer {
-    /// Number of robots per world.
     team: u32,
     #[pyo3(get)]
     first_robot: u32,
@@ -65,70 +54,11 @@ pub struct StepAnswer {
     dim: [usize; 3],
     payload: Py<PyArray1<u8>>,
     frames: PyOnceLock<Py<PyArray3<u8>>>,
-    /// The results of the first robot and its world.
     first: (WorldResult, RobotResult),
 }
 
 #[pymethods]
 impl StepAnswer {
-    #[new]
-    #[expect(clippy::too_many_arguments, reason = "the fields of the header")]
-    fn new(
-        py: Python<'_>,
-        team: u32,
-        height: usize,
-        width: usize,
-        first_robot: u32,
-        n_robots: u32,
-        flags: u32,
-        simulation_nanos: u64,
-        payload: Bound<'_, PyArray1<u8>>,
-    ) -> PyResult<Self> {
-        let is_small = height <= MAX_SIDE && width <= MAX_SIDE && n_robots <= MAX_ROBOTS;
-        if !is_small || n_robots == 0 || team == 0 {
-            let expected =
-                format!("1 to {MAX_ROBOTS} robots, on at most {MAX_SIDE} rows and columns");
-            let got = format!("{n_robots} robots, {team} in a world, {height} x {width} cells");
-            return Err(invalid(py, "answer", expected, got));
-        }
-        let mut answer = Self {
-            team,
-            first_robot,
-            n_robots,
-            simulation_nanos,
-            dim: [
-                n_frames((team, first_robot, n_robots, flags)),
-                height,
-                width,
-            ],
-            payload: payload.clone().unbind(),
-            frames: PyOnceLock::new(),
-            first: Default::default(),
-        };
-        let (expected, got) = (answer.n_bytes(), payload.len());
-        if expected != got {
-            return Err(invalid(py, "payload", format!("{expected} bytes"), got));
-        }
-        answer.first = answer.results_of(py, 0)?;
-        Ok(answer)
-    }
-
-    /// Returns the constructor's arguments, for copies and pickles.
-    fn __getnewargs__(&self, py: Python<'_>) -> Arguments {
-        let [n_frames, height, width] = self.dim;
-        let shares = n_frames < self.n_robots as usize;
-        (
-            self.team,
-            height,
-            width,
-            self.first_robot,
-            self.n_robots,
-            if shares { FLAG_TEAM_FRAMES } else { 0 },
-            self.simulation_nanos,
-            self.payload.clone_ref(py),
-        )
-    }
-
     #[getter]
     fn frames<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let made = self.frames.get_or_try_init(py, || {
@@ -179,21 +109,10 @@ impl StepAnswer {
     }
 
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
-        let Self {
-            first_robot,
-            simulation_nanos,
-            dim,
-            ..
-        } = self;
-        let [n_frames, height, width] = dim;
         let first = self.result(py, 0)?.repr()?;
-        let more = match self.n_robots - 1 {
-            0 => String::new(),
-            others => format!(", and {others} more"),
-        };
         Ok(format!(
-            "StepAnswer(first_robot={first_robot}, simulation_nanos={simulation_nanos}, \
-             frames=<uint8 ({n_frames}, {height}, {width})>, results=[{first}{more}])"
+            "<StepAnswer of {} robots: {first}, ...>",
+            self.n_robots
         ))
     }
 
@@ -215,7 +134,6 @@ impl StepAnswer {
 }
 
 impl StepAnswer {
-    /// Builds an answer from a reply's header and its payload.
     pub fn of(
         py: Python<'_>,
         team: u32,
@@ -229,29 +147,26 @@ impl StepAnswer {
             bytemuck::pod_read_unaligned(&payload[..WORLD_BYTES]),
             bytemuck::pod_read_unaligned(robot),
         );
-        let place = (team, reply.first_robot, reply.n_robots, reply.flags);
-        let (height, width) = shape.dim();
+        let n_frames = match reply.flags & FLAG_TEAM_FRAMES {
+            0 => reply.n_robots as usize,
+            _ => n_worlds,
+        };
         Self {
             team: team.max(1),
             first_robot: reply.first_robot,
             n_robots: reply.n_robots,
             simulation_nanos: reply.simulation_nanos,
-            dim: [n_frames(place), height, width],
+            dim: [n_frames, shape.height(), shape.width()],
             payload: PyArray1::from_vec(py, payload).unbind(),
             frames: PyOnceLock::new(),
             first,
         }
     }
 
-    fn n_worlds(&self) -> usize {
-        worlds_of(self.first_robot, self.n_robots, self.team).len()
-    }
-
     fn worlds_end(&self) -> usize {
-        self.n_worlds() * WORLD_BYTES
+        worlds_of(self.first_robot, self.n_robots, self.team).len() * WORLD_BYTES
     }
 
-    /// Returns the number of bytes that precede the frames.
     fn head(&self) -> usize {
         self.worlds_end() + self.n_robots as usize * ROBOT_BYTES
     }
@@ -260,7 +175,6 @@ impl StepAnswer {
         self.head() + self.dim.iter().product::<usize>()
     }
 
-    /// Returns the index of a robot's world. `index` counts from the first robot of this answer.
     fn world_of_robot(&self, index: usize) -> usize {
         let first = self.first_robot / self.team;
         ((self.first_robot + index as u32) / self.team - first) as usize
@@ -332,15 +246,6 @@ pub fn columns<'py>(
     ))
 }
 
-/// Returns the number of frames. The arguments are robots per world, first robot, number of robots, and flags.
-fn n_frames((team, first_robot, n_robots, flags): (u32, u32, u32, u32)) -> usize {
-    match flags & FLAG_TEAM_FRAMES {
-        0 => n_robots as usize,
-        _ => worlds_of(first_robot, n_robots, team).len(),
-    }
-}
-
-/// Returns the reward of a robot's step. `pays`: see `StepAnswer.numbers`.
 fn paid(pays: u8, world: &WorldResult, robot: &RobotResult) -> f64 {
     match pays {
         0 => robot.reward,

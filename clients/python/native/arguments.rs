@@ -22,12 +22,10 @@ impl<'py> FromPyObject<'_, 'py> for Number {
     }
 }
 
-/// Checks that a value is an integer that fits `u64`.
 pub fn count(given: &Bound<'_, PyAny>, subject: &str) -> PyResult<u64> {
     checked(given, "as_count", (given, subject, 0, u64::MAX))?.extract()
 }
 
-/// Returns paths of `n_moves` moves for `n_robots` robots as bytes.
 pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> PyResult<Vec<u8>> {
     if let Some(moves) = moves::paths(given, n_robots, n_moves) {
         return Ok(moves);
@@ -76,7 +74,6 @@ pub fn range_of(what: &str, given: &Bound<'_, PyAny>, whole: &Range<u32>) -> PyR
     })
 }
 
-/// Returns an absolute path as text; refuses paths that are not UTF-8.
 pub fn absolute_path(path: &Bound<'_, PyAny>) -> PyResult<String> {
     let py = path.py();
     let absolute = py.import("os.path")?.call_method1("abspath", (path,))?;
@@ -84,7 +81,6 @@ pub fn absolute_path(path: &Bound<'_, PyAny>) -> PyResult<String> {
     paths.call_method1("utf8", ("path", absolute))?.extract()
 }
 
-/// Converts a timeout; refuses NaN and negative numbers.
 pub fn duration(py: Python<'_>, seconds: f64) -> PyResult<Duration> {
     if !seconds.is_nan() && seconds >= 0.0 {
         return Ok(Duration::try_from_secs_f64(seconds.min(1e9)).unwrap_or_default());
@@ -93,7 +89,6 @@ pub fn duration(py: Python<'_>, seconds: f64) -> PyResult<Duration> {
     Err(invalid(py, "timeout", expected, seconds))
 }
 
-/// Calls a check of `emberwatch/common/arguments.py`.
 fn checked<'py>(
     given: &Bound<'py, PyAny>,
     check: &str,

@@ -27,17 +27,25 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// Steps that are expected to be shorter than this keep the interpreter locked: 1 ms, in nanoseconds.
 const BRIEF_NANOS: u64 = 1_000_000;
 
-/// Name of this program in the server's log.
 const NAME: &str = concat!("emberwatch-python ", env!("CARGO_PKG_VERSION"));
 
-/// A connection to a server (see `connect`) or to worlds in this process (see `embed`).
+/// A connection to a running server, or to worlds in this process (see `embed`).
 ///
 /// Close it after use, or use it as a context manager. Threads may share it: their requests run
 /// one after another. Every call waits at most `timeout` seconds for its answer.
 ///
+/// `instance` is the server's name, `timeout` the time in seconds to wait for its answer, and `wait`
+/// the time to wait for a server that is still starting.
+///
 /// Attributes:
 ///     info: A `ServerInfo`, the server's description of itself and its worlds.
 ///     instance: The server's instance name; "(embedded)" for worlds in this process.
+///
+/// Raises:
+///     NoServerError: If no server runs under this name within `wait` seconds.
+///     RequestTimeoutError: If the server does not answer.
+///     EmberwatchError: With code `"version_mismatch"` if the server has another protocol version,
+///         or `"channel"` if the channels cannot be opened or the server has too many clients.
 #[pyclass(frozen, subclass, weakref, dict, module = "emberwatch")]
 pub struct Client {
     pub worlds: Owned<Box<dyn Backend + Send>>,
@@ -52,46 +60,28 @@ pub struct Client {
     nanos_of_robot: AtomicU64,
 }
 
-/// Connects to a running server.
-///
-/// Args:
-///     instance: The server's instance name.
-///     timeout: Seconds to wait for the server's answer.
-///     wait: Seconds to wait for a server that is still starting; 0: fail at once.
-///
-/// Raises:
-///     NoServerError: If no server runs under this name within `wait` seconds.
-///     RequestTimeoutError: If the server does not answer.
-///     EmberwatchError: With code `"version_mismatch"` if the server has another protocol version,
-///         or `"channel"` if the channels cannot be opened or the server has too many clients.
-#[pyfunction]
-#[pyo3(signature = (instance="default", *, timeout=5.0, wait=0.0))]
-pub fn connect(py: Python<'_>, instance: &str, timeout: f64, wait: f64) -> PyResult<Client> {
-    let name = checked(py, instance)?;
-    let mut warned = Ok(());
-    let limits = (duration(py, wait)?, duration(py, timeout)?);
-    let opened = py.detach(|| {
-        let mut has_warned = false;
-        Connection::open_within(&name, NAME, limits, |error| {
-            if !has_warned {
-                let text = format!("{}; waiting up to {wait} s for a server", plain(error));
-                warned = Python::attach(|py| warn_in_log(py, &text));
-            }
-            has_warned = true;
-            warned.is_ok()
-        })
-    });
-    warned?;
-    let opened = opened.map_err(|error| raise(py, error, "'hello'", timeout))?;
-    Client::of(py, instance, Box::new(opened))
-}
-
 #[pymethods]
 impl Client {
     #[new]
-    #[pyo3(signature = (instance="default", *, timeout=5.0))]
-    fn new(py: Python<'_>, instance: &str, timeout: f64) -> PyResult<Self> {
-        connect(py, instance, timeout, 0.0)
+    #[pyo3(signature = (instance="default", *, timeout=5.0, wait=0.0))]
+    fn new(py: Python<'_>, instance: &str, timeout: f64, wait: f64) -> PyResult<Self> {
+        let name = checked(py, instance)?;
+        let mut warned = Ok(());
+        let limits = (duration(py, wait)?, duration(py, timeout)?);
+        let opened = py.detach(|| {
+            let mut has_warned = false;
+            Connection::open_within(&name, NAME, limits, |error| {
+                if !has_warned {
+                    let text = format!("{}; waiting up to {wait} s for a server", plain(error));
+                    warned = Python::attach(|py| warn_in_log(py, &text));
+                }
+                has_warned = true;
+                warned.is_ok()
+            })
+        });
+        warned?;
+        let opened = opened.map_err(|error| raise(py, error, "'hello'", timeout))?;
+        Self::of(py, instance, Box::new(opened))
     }
 
     /// Creates worlds in this process from checked settings; see `embed`.
@@ -114,7 +104,6 @@ impl Client {
     ///     n_robots: Number of robots.
     ///     takeover: Whether to take robots away from the clients that hold them.
     ///     ttl: Seconds without use after which the lease expires; None: the server's default.
-    ///     timeout: Seconds to wait for the answer.
     ///
     /// Raises:
     ///     EmberwatchError: With code `"busy"` if another client holds one of the robots, or
@@ -149,7 +138,6 @@ impl Client {
     ///     first_robot: The number of the first robot.
     ///     n_robots: Number of robots.
     ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
     #[pyo3(signature = (first_robot=Number(0), n_robots=Number(1), *, team=false, timeout=5.0))]
     #[pyo3(text_signature = "($self, first_robot=0, n_robots=1, *, team=False, timeout=5.0)")]
     fn observe(
@@ -167,11 +155,7 @@ impl Client {
     /// Returns the results and frames of an earlier step k of the episode.
     ///
     /// Args:
-    ///     step: The step k.
-    ///     first_robot: The number of the first robot.
-    ///     n_robots: Number of robots.
-    ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
+    ///     step: The step k. The other arguments are those of `observe`.
     ///
     /// Raises:
     ///     EmberwatchError: With code `"not_kept"` if the server has discarded the step; `detail`
@@ -197,16 +181,12 @@ impl Client {
         self.look(py, place, bytemuck::cast_slice(&body), timeout)
     }
 
-    /// Writes worlds to a file on the server's host, for `Lease.restore`. Needs no lease.
+    /// Writes worlds to a file on the server's host, for `Lease.restore`, and returns their states.
     ///
     /// Args:
     ///     path: The file. A relative path starts at this process's working directory.
     ///     first_world: The first world to write.
     ///     n_worlds: Number of worlds; None: all worlds from `first_world` on.
-    ///     timeout: Seconds to wait for the answer.
-    ///
-    /// Returns:
-    ///     The state of each world in the file, a tuple of `WorldInfo`.
     #[pyo3(text_signature = "($self, path, first_world=0, n_worlds=None, *, timeout=600.0)")]
     #[pyo3(signature = (path, first_world=Number(0), n_worlds=None, *, timeout=600.0))]
     fn snapshot<'py>(
@@ -262,27 +242,7 @@ impl Client {
         stopped.map(drop)
     }
 
-    /// Sends a JSON request (PROTOCOL.md section 6), and returns the reply's keys and values.
-    #[pyo3(signature = (request, *, timeout))]
-    fn control<'py>(
-        &self,
-        py: Python<'py>,
-        request: &Bound<'py, PyAny>,
-        timeout: f64,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        let json = py.import("json")?;
-        let text: String = json.call_method1("dumps", (request,))?.extract()?;
-        let limit = duration(py, timeout)?;
-        let answer = self.ask(py, "a control request", timeout, |backend| {
-            backend.control_text(text.as_bytes(), limit)
-        })?;
-        json.call_method1("loads", (answer,))
-    }
-
-    /// Returns the hidden states of worlds in this process, one `Truth` for each world.
-    ///
-    /// Raises:
-    ///     InvalidArgumentError: Unless these worlds are in this process, with `publish_truth`.
+    /// Returns the hidden states of worlds in this process with `publish_truth`, one `Truth` each.
     fn truths<'py>(
         &self,
         py: Python<'py>,
@@ -297,9 +257,6 @@ impl Client {
     }
 
     /// Returns the state of all worlds in this process, as bytes of a snapshot.
-    ///
-    /// Raises:
-    ///     InvalidArgumentError: If the worlds are on a server; see `snapshot`.
     fn clone_state(&self, py: Python<'_>) -> PyResult<Cow<'static, [u8]>> {
         let clone = |backend: &mut dyn Backend| backend.clone_state();
         self.ask(py, "clone_state", 0.0, clone).map(Cow::from)
@@ -307,11 +264,8 @@ impl Client {
 
     /// Replaces all worlds in this process with the worlds that `clone_state` returned.
     ///
-    /// Then call `Lease.observe`: the next paths start from the steps that it returns.
-    ///
-    /// Raises:
-    ///     InvalidArgumentError: If the bytes are damaged or of other worlds, or the worlds are on
-    ///         a server. No world has changed then.
+    /// Then call `Lease.observe`: the next paths start from the steps that it returns. If the bytes
+    /// are damaged or of other worlds, no world changes.
     fn restore_state(&self, py: Python<'_>, worlds: Cow<'_, [u8]>) -> PyResult<()> {
         let restore = |backend: &mut dyn Backend| backend.restore_state(&worlds);
         self.ask(py, "restore_state", 0.0, restore)
@@ -394,7 +348,6 @@ impl Client {
         self.answered(py, answer, seconds)
     }
 
-    /// Converts an answer to its Python object, or an error to its exception.
     pub fn answered(
         &self,
         py: Python<'_>,
@@ -414,7 +367,6 @@ impl Client {
         self.is_embedded && nanos > 0 && nanos.saturating_mul(n_robots.into()) < BRIEF_NANOS
     }
 
-    /// Records how long a step of this number of robots took.
     pub fn took(&self, nanos: u64, n_robots: u32) {
         let nanos = nanos / u64::from(n_robots.max(1));
         self.nanos_of_robot.store(nanos.max(1), Ordering::Relaxed);
@@ -425,12 +377,10 @@ fn robots(first: Number, n_robots: Number) -> Range<u32> {
     first.0..first.0.saturating_add(n_robots.0)
 }
 
-/// Checks an instance's name.
 pub fn checked(py: Python<'_>, instance: &str) -> PyResult<Instance> {
     Instance::new(instance).map_err(|error| raise_of_channel(py, error))
 }
 
-/// Logs a warning as the package `emberwatch`.
 pub fn warn_in_log(py: Python<'_>, text: &str) -> PyResult<()> {
     let logger = py
         .import("logging")?

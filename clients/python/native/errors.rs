@@ -17,7 +17,6 @@ thread_local! {
     static RAISED: RefCell<Option<PyErr>> = const { RefCell::new(None) };
 }
 
-/// Runs Python's signal handlers; returns whether one raised an exception.
 pub fn interrupted() -> bool {
     // Python runs signal handlers only on its main thread, so other threads need not wait for the interpreter here.
     #[cfg(target_os = "linux")]
@@ -34,7 +33,6 @@ pub fn interrupted() -> bool {
         })
 }
 
-/// Returns the exception of the last call of [`interrupted`] that returned true.
 pub fn raised() -> PyErr {
     RAISED
         .take()
@@ -55,12 +53,10 @@ pub fn error<'py>(py: Python<'py>, name: &str, arguments: impl PyCallArgs<'py>) 
     made.map_or_else(|error| error, PyErr::from_value)
 }
 
-/// Creates the exception for insufficient memory.
 pub fn no_memory(py: Python<'_>, short: &NoMemory) -> PyErr {
     error(py, "NotEnoughMemoryError", (short.to_string(),))
 }
 
-/// Checks that there is enough memory for data whose size depends on arguments.
 pub fn check_memory(py: Python<'_>, what: impl Display, n_bytes: usize) -> PyResult<()> {
     // Reading the memory limits takes about 0.1 ms, so less than 16 MiB is not checked.
     if n_bytes < 16 << 20 {
@@ -69,7 +65,6 @@ pub fn check_memory(py: Python<'_>, what: impl Display, n_bytes: usize) -> PyRes
     memory::check(what, n_bytes as u64).map_err(|short| no_memory(py, &short))
 }
 
-/// Creates the exception for threads that the system could not start.
 pub fn no_threads(py: Python<'_>, short: &NoThreads) -> PyErr {
     error(py, "EmberwatchError", (short.to_string(), "threads"))
 }
@@ -80,7 +75,6 @@ pub fn warn(py: Python<'_>, words: impl Display) -> PyResult<()> {
     PyErr::warn(py, &py.get_type::<PyUserWarning>(), &words, 1)
 }
 
-/// Creates the exception for a request that failed. `what` names the request; `seconds` was its timeout.
 pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64) -> PyErr {
     match problem {
         ConnectionError::Channel(problem) => raise_of_channel(py, problem),
@@ -108,7 +102,6 @@ pub fn raise(py: Python<'_>, problem: ConnectionError, what: &str, seconds: f64)
     }
 }
 
-/// Creates the exception for a channel that could not be opened or used.
 pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
     let text = plain(&problem);
     match problem {
@@ -125,7 +118,6 @@ pub fn raise_of_channel(py: Python<'_>, problem: ChannelError) -> PyErr {
     }
 }
 
-/// Creates the exception for an invalid answer or sample.
 pub fn bad_answer(py: Python<'_>, problem: &str) -> PyErr {
     error(py, "EmberwatchError", (problem, "bad_answer"))
 }

@@ -26,7 +26,6 @@ use std::any::Any;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 
-/// An array with one number per world.
 type Numbers<'py> = Bound<'py, PyArray1<f64>>;
 
 /// Beliefs about `n` worlds. Only one thread at a time may use them. In all methods, `chosen` is a mask of worlds,
@@ -47,14 +46,11 @@ pub struct Estimators {
     #[pyo3(get)]
     is_single: bool,
     shape: Shape,
-    /// Copies share it.
     origin: Arc<Origin>,
     state: Mutex<State>,
-    /// The threads of the call that uses the state.
     threads: Mutex<Pool>,
 }
 
-/// The estimators, which only one call at a time may use.
 struct State {
     worlds: Vec<Box<dyn Estimator>>,
     /// Number of predictions of each world since the first belief.
@@ -63,7 +59,6 @@ struct State {
     is_unfinished: bool,
 }
 
-/// Copies the correlations between cells that a spatial filter has learned. Does nothing for other kinds of estimators.
 fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
     let from = (from as &dyn Any).downcast_ref::<SpatialFilter>();
     let to = (to as &mut dyn Any).downcast_mut::<SpatialFilter>();
@@ -74,7 +69,6 @@ fn keep_correlations(from: &dyn Estimator, to: &mut dyn Estimator) {
 
 #[pymethods]
 impl Estimators {
-    /// Builds beliefs from a known model. `prior` is the first belief about each world, `[S, H, W]`.
     #[staticmethod]
     fn known(
         py: Python<'_>,
@@ -91,8 +85,7 @@ impl Estimators {
         Self::new(py, Origin::known(py, model, prior, kind)?.into(), n_worlds)
     }
 
-    /// Loads beliefs from a checkpoint, or from a file of `save`. `kind` defaults to the kind that the checkpoint was
-    /// trained for. If a model is given, checks that the checkpoint fits it. A saved belief takes no other arguments.
+    /// Loads a checkpoint, or a file of `save`.
     #[staticmethod]
     fn load(
         py: Python<'_>,
@@ -123,7 +116,6 @@ impl Estimators {
         Self::new(py, origin.into(), n_worlds)
     }
 
-    /// Returns an independent copy.
     fn copy(&self, py: Python<'_>) -> PyResult<Self> {
         let worlds = self.saved(py)?;
         let n_worlds = (!self.is_single).then_some(self.n_worlds);
@@ -132,7 +124,6 @@ impl Estimators {
         Ok(copy)
     }
 
-    /// Returns the beliefs and everything that they are built from, for [`Self::from_bytes`].
     fn to_bytes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
         Ok(PyBytes::new(py, &self.encoded(py)?))
     }
@@ -148,7 +139,6 @@ impl Estimators {
         Ok(it)
     }
 
-    /// Writes the bytes of [`Self::to_bytes`] to a file, completely or not at all.
     fn save(&self, py: Python<'_>, file: PathBuf) -> PyResult<()> {
         let bytes = self.encoded(py)?;
         let written = py.detach(|| replace_file(&file, &bytes));
@@ -161,7 +151,6 @@ impl Estimators {
         Ok((!state.is_unfinished).then(|| state.steps.clone()))
     }
 
-    /// Draws each cell's state from its own distribution, `[n, H, W]`.
     fn sample<'py>(&self, py: Python<'py>, seed: u64) -> PyResult<Bound<'py, PyArray3<u8>>> {
         if self.origin.kind.is_of_observations {
             let got = format!("'{}', which predicts observations", self.kind);
@@ -172,7 +161,6 @@ impl Estimators {
         })
     }
 
-    /// Returns the number of worlds, the height and the width.
     #[getter]
     fn shape(&self) -> (usize, usize, usize) {
         (self.n_worlds, self.shape.height(), self.shape.width())
@@ -191,13 +179,10 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// Returns the entropy of each cell in nats, `[n, H, W]`.
     fn entropy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         self.of_cells(py, true, |_, belief| belief.entropy())
     }
 
-    /// Resets the chosen worlds to the first belief. With `keeps_correlations`, spatial filters keep the correlations
-    /// between cells that they have learned.
     fn reset(
         &self,
         py: Python<'_>,
@@ -216,7 +201,6 @@ impl Estimators {
             }
             Ok((world, step, new))
         });
-        // Either all worlds are reset, or none.
         let reset: anyhow::Result<Vec<_>> = reset?.into_iter().collect();
         for (world, step, new) in reset.map_err(|error| raise(py, &error))? {
             (*world, *step) = (new, 0);
@@ -225,7 +209,6 @@ impl Estimators {
         Ok(())
     }
 
-    /// Corrects the beliefs about the chosen worlds with their frames. `frames`, `[n, H, W]`, has one frame per world.
     fn correct(
         &self,
         py: Python<'_>,
@@ -258,7 +241,6 @@ impl Estimators {
         Err(raised)
     }
 
-    /// Predicts: moves the beliefs about the chosen worlds from X_k to X_{k+1}.
     fn predict(&self, py: Python<'_>, chosen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let mut state = self.state(py)?;
         let chosen = chosen.as_slice()?;
@@ -272,8 +254,7 @@ impl Estimators {
         predicted.map(|_| ())
     }
 
-    /// Scores the beliefs against hidden states `[n, H, W]`. Returns three arrays with one value per world: log losses,
-    /// Brier scores for the state `target`, and shares of cells whose most probable state is right.
+    /// Returns log losses, Brier scores for the state `target`, and shares of cells whose most probable state is right.
     fn scores<'py>(
         &self,
         py: Python<'py>,
@@ -304,8 +285,7 @@ impl Estimators {
         Ok((losses, briers, accuracies))
     }
 
-    /// Scores the beliefs' predictions of frames `[n, H, W]`. Returns the log-likelihood, summed over the observed
-    /// cells, and the number of observed cells.
+    /// Returns the log-likelihood, summed over the observed cells, and the number of these cells.
     fn score_frames<'py>(
         &self,
         py: Python<'py>,
@@ -329,7 +309,6 @@ impl Estimators {
 }
 
 impl Estimators {
-    /// Builds the beliefs before the first frame. `n_worlds` is `None` for a single world without an axis for worlds.
     fn new(py: Python<'_>, origin: Arc<Origin>, n_worlds: Option<usize>) -> PyResult<Self> {
         let (is_single, n_worlds) = (n_worlds.is_none(), n_worlds.unwrap_or(1));
         let kind = origin.kind;
@@ -365,7 +344,6 @@ impl Estimators {
         })
     }
 
-    /// Returns the number of predictions and the state of each world.
     fn saved(&self, py: Python<'_>) -> PyResult<Vec<(u64, Vec<u8>)>> {
         let Some(handover) = self.origin.kind.traits.handover else {
             let got = format!("'{}', which cannot", self.kind);
@@ -398,7 +376,6 @@ impl Estimators {
         Ok(py.detach(|| saved.to_bytes()))
     }
 
-    /// Restores all worlds from numbers of predictions and states that beliefs with the same sources have saved.
     fn restore<W: AsRef<[u8]> + Sync>(&self, py: Python<'_>, saved: &[(u64, W)]) -> PyResult<()> {
         let mut state = self.state(py)?;
         let handover = self.origin.kind.traits.handover_mut;
@@ -416,10 +393,7 @@ impl Estimators {
         Ok(())
     }
 
-    /// Applies `work` to each task, unless a signal handler raises an exception meanwhile. Cheap work runs on this thread.
-    ///
-    /// # Errors
-    /// That exception. Some tasks are then done, and others are not.
+    /// Applies `work` to each task, until a signal handler raises an exception. Cheap work runs on this thread.
     fn each<T: Send, U: Send>(
         &self,
         py: Python<'_>,
@@ -436,7 +410,6 @@ impl Estimators {
         done.ok_or_else(raised)
     }
 
-    /// Computes an array `[n, H, W]` from the belief about each world.
     fn of_cells<'py, T: Element + Copy + Default + Send>(
         &self,
         py: Python<'py>,
@@ -458,15 +431,11 @@ impl Estimators {
         Ok(out.into_pyarray(py))
     }
 
-    /// Returns the number of probabilities in the belief about one world.
     fn n_numbers(&self) -> usize {
         self.state_names.len() * self.shape.n_cells()
     }
 
-    /// Locks the estimators for this thread.
-    ///
-    /// # Errors
-    /// If another thread is using them, or a signal interrupted an earlier call.
+    /// Refuses beliefs that another thread uses, or that a signal left unfinished.
     fn state(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
         let state = self.locked(py)?;
         if state.is_unfinished {
@@ -476,7 +445,6 @@ impl Estimators {
         Ok(state)
     }
 
-    /// Like [`Self::state`], but also locks unfinished beliefs.
     fn locked(&self, py: Python<'_>) -> PyResult<MutexGuard<'_, State>> {
         match self.state.try_lock() {
             Ok(state) => Ok(state),
@@ -488,7 +456,6 @@ impl Estimators {
         }
     }
 
-    /// Decodes the frames of the chosen worlds; `None` for the other worlds.
     fn frames(
         &self,
         py: Python<'_>,
@@ -513,7 +480,6 @@ fn named(worlds: &[usize]) -> String {
     format!("world{plural} {}", shortened(&numbers.join(", ")))
 }
 
-/// Creates the exception for a belief that could not be built, or could not be corrected with a frame.
 pub fn raise(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     let is_impossible = matches!(
         error.downcast_ref::<EstimatorError>(),

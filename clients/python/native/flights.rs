@@ -14,7 +14,6 @@ use numpy::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::PyType;
 
 type Arguments = (
     usize,
@@ -26,18 +25,16 @@ type Arguments = (
     Vec<(usize, usize)>,
 );
 
-/// The current path of each robot, up to its latest move.
+/// The current path of each robot, up to its latest move. Arguments have one entry for each robot.
 ///
 /// No method releases the interpreter lock, because another thread that used this object meanwhile would get an error.
 #[pyclass(module = "emberwatch._native")]
 pub struct Flights {
     shape: Shape,
     airspace: Airspace,
-    /// The Python `Airspace` that this was built from.
     given: Option<Py<PyAny>>,
     n_moves: usize,
-    /// The reward of each hidden state. A cell pays the reward of its state when it is first visited. `None`: no
-    /// rewards.
+    /// Of each hidden state, which a cell pays when it is first visited.
     reward: Option<Vec<f64>>,
     cells: Vec<Cell>,
     n_made: Vec<usize>,
@@ -98,19 +95,16 @@ impl Flights {
         })
     }
 
-    /// Returns the class and its arguments, for copies and pickles. A copy starts without paths.
-    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> (Bound<'py, PyType>, Arguments) {
-        let this = slf.borrow();
-        let (height, width) = this.shape.dim();
-        let reward = this.reward.clone();
-        let given = this.given.as_ref().map(|it| it.clone_ref(slf.py()));
-        let windows = this.windows.iter().map(Windows::dim).collect();
-        let n_rows = this.cells.len();
-        let arguments = (n_rows, height, width, this.n_moves, reward, given, windows);
-        (slf.get_type(), arguments)
+    /// Returns the constructor's arguments, for copies and pickles, which start without paths.
+    fn __getnewargs__(&self, py: Python<'_>) -> Arguments {
+        let (height, width) = self.shape.dim();
+        let reward = self.reward.clone();
+        let given = self.given.as_ref().map(|it| it.clone_ref(py));
+        let windows = self.windows.iter().map(Windows::dim).collect();
+        let n_rows = self.cells.len();
+        (n_rows, height, width, self.n_moves, reward, given, windows)
     }
 
-    /// Row and column of each robot, `[n_rows, 2]`.
     #[getter]
     fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<i64>>> {
         let cells = self.cells.iter();
@@ -118,7 +112,6 @@ impl Flights {
         PyArray1::from_iter(py, flat).reshape([self.cells.len(), 2])
     }
 
-    /// Number of moves that each robot has made in its current path.
     #[getter]
     fn n_made<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i64>> {
         PyArray1::from_iter(py, self.n_made.iter().map(|&n| n as i64))
@@ -131,7 +124,6 @@ impl Flights {
         PyArray1::from_slice(py, &self.visited).reshape([self.cells.len(), height, width])
     }
 
-    /// The reward of each path so far.
     #[getter]
     fn paid<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         PyArray1::from_slice(py, &self.paid)
@@ -150,8 +142,6 @@ impl Flights {
         PyArray1::from_vec(py, masks).reshape([self.cells.len(), Move::ALL.len()])
     }
 
-    /// Begins the paths of the rows marked in `begun`. `robots`, `[n_rows, 2]`, and the hidden `states`,
-    /// `[n_rows, H, W]`, cover all rows.
     fn start_paths(
         &mut self,
         py: Python<'_>,
@@ -167,9 +157,6 @@ impl Flights {
             let (expected, got) = (format!("shape {dim:?}"), format!("{got:?}"));
             return Err(invalid(py, "states", expected, got));
         }
-        if begun.len() != self.cells.len() || robots.dim() != (self.cells.len(), 2) {
-            return Err(PyValueError::new_err("begin: expected one entry per row"));
-        }
         for row in (0..begun.len()).filter(|&row| begun[row]) {
             let cell = [robots[[row, 0]], robots[[row, 1]]].map(|at| usize::try_from(at).ok());
             let cell = match cell {
@@ -184,7 +171,6 @@ impl Flights {
         Ok(())
     }
 
-    /// Returns, for each row, whether its next move is the last of its path.
     fn completes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
         PyArray1::from_iter(py, self.n_made.iter().map(|n| n + 1 == self.n_moves))
     }
@@ -195,26 +181,17 @@ impl Flights {
         py: Python<'py>,
         actions: PyReadonlyArray1<'_, u8>,
     ) -> PyResult<Bound<'py, PyArray2<u8>>> {
-        let actions = actions.as_array();
-        if actions.len() != self.cells.len() {
-            return Err(PyValueError::new_err("paths: expected one action per row"));
-        }
         let mut paths = self.moves.clone();
-        let last = paths
-            .iter_mut()
-            .skip(self.n_moves - 1)
-            .step_by(self.n_moves);
-        last.zip(actions).for_each(|(last, &action)| *last = action);
+        let rows = paths.chunks_exact_mut(self.n_moves);
+        for (row, &action) in rows.zip(actions.as_array()) {
+            row[self.n_moves - 1] = action;
+        }
         PyArray1::from_vec(py, paths).reshape([self.cells.len(), self.n_moves])
     }
 
-    /// Returns the moves that one robot has made in its current path.
-    fn made<'py>(&self, py: Python<'py>, row: usize) -> PyResult<Bound<'py, PyArray1<u8>>> {
-        let n_rows = self.cells.len();
-        let expected = || invalid(py, "row", format!("a row below {n_rows}"), row);
-        let n_made = *self.n_made.get(row).ok_or_else(expected)?;
-        let made = &self.moves[row * self.n_moves..][..n_made];
-        Ok(PyArray1::from_slice(py, made))
+    fn made<'py>(&self, py: Python<'py>, row: usize) -> Bound<'py, PyArray1<u8>> {
+        let made = &self.moves[row * self.n_moves..][..self.n_made[row]];
+        PyArray1::from_slice(py, made)
     }
 
     /// Sets the channels about the world in the windows of the rows marked in `begun`, whose paths begin, to `shown`,
@@ -224,20 +201,12 @@ impl Flights {
         windows: usize,
         begun: PyReadonlyArray1<'_, bool>,
         shown: PyReadonlyArray4<'_, u8>,
-    ) -> PyResult<()> {
-        let (begun, shown) = (begun.as_array(), shown.as_array());
-        let (height, width) = self.shape.dim();
-        let windows = &mut self.windows[windows];
-        let n_begun = begun.iter().filter(|it| **it).count();
-        let dim = (n_begun, height, width, windows.dim().1);
-        if begun.len() != self.cells.len() || shown.dim() != dim {
-            let words = "show: expected one flag per row, and a world for each row that begins";
-            return Err(PyValueError::new_err(words));
-        }
+    ) {
+        let begun = begun.as_array();
         let rows = (0..begun.len()).filter(|&row| begun[row]);
-        rows.zip(shown.outer_iter())
-            .for_each(|(row, shown)| windows.show(row, shown));
-        Ok(())
+        for (row, shown) in rows.zip(shown.as_array().outer_iter()) {
+            self.windows[windows].show(row, shown);
+        }
     }
 
     /// Returns windows, `[n_rows, side, side, channels]`, as a new array.
@@ -258,27 +227,15 @@ impl Flights {
         py: Python<'py>,
         moved: PyReadonlyArray1<'_, bool>,
         actions: PyReadonlyArray1<'_, u8>,
-    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        let (moved, actions) = (moved.as_array(), actions.as_array());
-        if moved.len() != self.cells.len() || actions.len() != self.cells.len() {
-            return Err(PyValueError::new_err("move: expected one action per row"));
-        }
-        let is_over = |(&moves, &n_made): (&bool, &usize)| moves && n_made >= self.n_moves;
-        if moved.iter().zip(&self.n_made).any(is_over) {
-            return Err(PyValueError::new_err(
-                "move: expected a path with moves left",
-            ));
-        }
-        let rows = moved.iter().zip(actions).enumerate();
-        let paid = rows.map(|(row, (&moves, &action))| {
-            if moves {
-                self.make_move(row, action)
-            } else {
-                0.0
+    ) -> Bound<'py, PyArray1<f64>> {
+        let mut paid = vec![0.0; self.cells.len()];
+        let rows = moved.as_array();
+        for (row, &action) in actions.as_array().iter().enumerate() {
+            if rows[row] {
+                paid[row] = self.make_move(row, action);
             }
-        });
-        let paid: Vec<f64> = paid.collect();
-        Ok(PyArray1::from_vec(py, paid))
+        }
+        PyArray1::from_vec(py, paid)
     }
 }
 
@@ -289,7 +246,6 @@ impl Flights {
         (255.0 * (1.0 - made)).round_ties_even() as u8
     }
 
-    /// Clears the visited cells of the rows marked in `begun`, and stores the hidden states of these rows.
     fn enter(&mut self, begun: ArrayView1<'_, bool>, states: Option<ArrayView3<'_, u8>>) {
         let n_cells = self.shape.n_cells();
         for row in (0..begun.len()).filter(|&row| begun[row]) {

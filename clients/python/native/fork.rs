@@ -7,7 +7,6 @@ use emberwatch_protocol::turn;
 use pyo3::prelude::*;
 use pyo3::types::IntoPyDict;
 
-/// Registers the hooks with Python, which calls them at each fork of this process.
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
     let hooks = [

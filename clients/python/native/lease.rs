@@ -26,7 +26,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 ///
 /// Attributes:
 ///     client: The `Client` that acquired it.
-///     number: The lease's number on the server.
 ///     ttl: Seconds without use after which the lease expires.
 ///     robots: The numbers of its robots, a range.
 ///     worlds: The worlds of these robots, a range.
@@ -46,11 +45,6 @@ pub struct Lease {
 
 #[pymethods]
 impl Lease {
-    #[getter]
-    fn number(&self) -> u64 {
-        self.lease.number()
-    }
-
     #[getter]
     fn robots<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyRange>> {
         python_range(py, &self.robots)
@@ -72,13 +66,10 @@ impl Lease {
     ///         in one or more worlds. None: all robots of the lease.
     ///     full: Whether to observe every cell. Requires a server with coverage "client" or "full".
     ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
     ///
     /// Raises:
-    ///     InvalidArgumentError: If the paths do not have this shape, type and range.
     ///     LeaseLostError: If the lease expired or a robot was taken over.
     ///     RequestTimeoutError: If no answer arrives; `observe` shows whether the step was made.
-    ///     ServerGoneError: If the server ended.
     ///     EmberwatchError: With code `"late"` if the world moved on without this path; `observe`
     ///         shows to which step. With code `"episode_over"` if the episode has ended: reset that
     ///         world.
@@ -108,8 +99,7 @@ impl Lease {
     /// moved counts as having moved on without these paths.
     ///
     /// Args:
-    ///     paths: As in `step`.
-    ///     robots: As in `step`.
+    ///     paths, robots: As in `step`.
     ///     accepts_late: Whether to return the current results of a world that moved on without
     ///         these paths, instead of raising the error with code `"late"`.
     ///     timeout: Seconds to wait before each check whether the worlds have moved. The server's
@@ -153,8 +143,7 @@ impl Lease {
     ///
     /// Args:
     ///     robots: The numbers of consecutive robots; None: all robots of the lease.
-    ///     team: Whether to return one frame for each world's team instead of one for each robot.
-    ///     timeout: Seconds to wait for the answer.
+    ///     team: As in `step`.
     #[pyo3(signature = (*, robots=None, team=false, timeout=5.0))]
     fn observe(
         &self,
@@ -172,16 +161,12 @@ impl Lease {
 
     /// Begins new episodes: burn-in, then k = 0, robots at their start cells, empty frames.
     ///
-    /// No other client may hold robots of these worlds.
+    /// No other client may hold robots of these worlds. Returns the state of each, in the given order.
     ///
     /// Args:
     ///     seeds: One seed for each world; None: the server derives each seed from the world's last
     ///         seed.
     ///     worlds: The worlds to reset; None: all worlds of the lease.
-    ///     timeout: Seconds to wait for the answer.
-    ///
-    /// Returns:
-    ///     The state of each reset world, in the given order: a tuple of `WorldInfo`.
     #[pyo3(signature = (seeds=None, *, worlds=None, timeout=600.0))]
     fn reset<'py>(
         &self,
@@ -199,7 +184,7 @@ impl Lease {
         })
     }
 
-    /// Replaces worlds of the lease with worlds from a snapshot file.
+    /// Replaces worlds of the lease with worlds from a snapshot file, and returns their states.
     ///
     /// The restored worlds continue exactly as the saved ones would have.
     ///
@@ -207,10 +192,6 @@ impl Lease {
     ///     path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
     ///     worlds: The consecutive worlds to replace; None: all worlds of the lease.
     ///     first: The number of the first world in the file to use; the next worlds follow.
-    ///     timeout: Seconds to wait for the answer.
-    ///
-    /// Returns:
-    ///     The state of each restored world, a tuple of `WorldInfo`.
     #[pyo3(signature = (path, *, worlds=None, first=Number(0), timeout=600.0))]
     #[pyo3(text_signature = "($self, path, *, worlds=None, first=0, timeout=600.0)")]
     fn restore<'py>(
@@ -233,12 +214,9 @@ impl Lease {
         })
     }
 
-    /// Replaces the lease's world `target` with a copy of the world `source`.
+    /// Replaces the lease's world `target` with a copy of the world `source`; returns its state.
     ///
     /// With the same actions, both worlds have the same future.
-    ///
-    /// Returns:
-    ///     The state of the world `target`, a tuple of one `WorldInfo`.
     #[pyo3(signature = (source, target, *, timeout=5.0))]
     fn fork<'py>(
         &self,
@@ -260,7 +238,6 @@ impl Lease {
     ///     kind: The format of the bytes, for other agents. At most 256 bytes.
     ///     data: At most 32,768 bytes plus 76 per cell; more if the model has over 18 states.
     ///     robot: The robot's number; None: the first robot of the lease.
-    ///     timeout: Seconds to wait for the answer.
     #[pyo3(signature = (result, kind, data, *, robot=None, timeout=5.0))]
     fn leave_belief(
         &self,
@@ -325,7 +302,7 @@ impl Lease {
 
     fn __repr__(&self) -> String {
         let Range { start, end } = self.robots;
-        format!("<Lease {} of robots {start} to {}>", self.number(), end - 1)
+        format!("<Lease of robots {start} to {}>", end - 1)
     }
 }
 
@@ -346,7 +323,6 @@ impl Lease {
         })
     }
 
-    /// Returns the chosen robots of the lease; by default all.
     fn part(&self, robots: Option<&Bound<'_, PyAny>>) -> PyResult<Range<u32>> {
         match robots {
             Some(robots) => range_of("robots", robots, &self.robots),
@@ -396,7 +372,6 @@ impl Lease {
         Ok(answer)
     }
 
-    /// Logs that a step waits for the paths of other robots.
     fn warn_of_wait(&self, py: Python<'_>, first_robot: u32) -> PyResult<()> {
         let world = worlds_of(first_robot, 1, self.client.get().server.n_robots).start;
         let text = format!(

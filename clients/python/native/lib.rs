@@ -51,13 +51,11 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<answer::StepAnswer>()?;
     module.add_function(wrap_pyfunction!(answer::columns, module)?)?;
     module.add_class::<client::Client>()?;
-    module.add_function(wrap_pyfunction!(client::connect, module)?)?;
     module.add_class::<flights::Flights>()?;
     module.add_class::<lease::Lease>()?;
     module.add_class::<reader::Observer>()?;
     module.add_class::<reader::OutlookReader>()?;
     module.add_class::<reader::TruthReader>()?;
-    module.add_function(wrap_pyfunction!(reader::observe, module)?)?;
     module.add_class::<recording::Recording>()?;
     module.add_class::<dynamics::Dynamics>()?;
     module.add_class::<estimators::Estimators>()?;
@@ -80,8 +78,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("MAX_SIDE", MAX_SIDE)?;
     module.add("MAX_VALUES", MAX_VALUES)?;
     module.add_function(wrap_pyfunction!(model::built_in, module)?)?;
-    module.add_function(wrap_pyfunction!(model::description_with_radius, module)?)?;
-    module.add_function(wrap_pyfunction!(model::model_with_radius, module)?)?;
+    module.add_function(wrap_pyfunction!(model::with_radius, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_description, module)?)?;
     module.add_function(wrap_pyfunction!(model::read_model, module)?)?;
     module.add_function(wrap_pyfunction!(planning::beam_search, module)?)?;

@@ -1,24 +1,17 @@
 //! Figures of merit of runs on several worlds.
 
 use crate::model::shape_of;
-use crate::refusal::invalid;
 use emberwatch_belief::merit::{self, Found};
+use emberwatch_model::Cell;
 use emberwatch_model::path::Flight;
-use emberwatch_model::{Cell, Shape};
-use numpy::ndarray::{ArrayView1, ArrayView2, ArrayView3, Axis};
+use numpy::ndarray::{ArrayView1, ArrayView2, Axis};
 use numpy::{PyReadonlyArray1, PyReadonlyArray3};
-use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 
-/// The figures of a row of Python's benchmark, from `steps_to_detection` to `grid_seen_share`.
 type Figures = (Option<u64>, Option<u32>, Option<f64>, Option<f64>, f64);
 
-/// The running figures of merit of several worlds, which step together.
 #[pyclass(module = "emberwatch._native")]
-pub struct MeritTally {
-    shape: Shape,
-    worlds: Vec<merit::MeritTally>,
-}
+pub struct MeritTally(Vec<merit::MeritTally>);
 
 #[pymethods]
 impl MeritTally {
@@ -30,29 +23,23 @@ impl MeritTally {
         width: usize,
         target: u8,
     ) -> PyResult<Self> {
-        let shape = shape_of(py, height, width)?;
-        let tally = merit::MeritTally::new(shape, target);
-        Ok(Self {
-            shape,
-            worlds: vec![tally; n_worlds],
-        })
+        let tally = merit::MeritTally::new(shape_of(py, height, width)?, target);
+        Ok(Self(vec![tally; n_worlds]))
     }
 
-    /// Adds one step of all worlds.
+    /// Adds one step of all worlds. Arrays have a row for each world.
     fn update(
         &mut self,
-        py: Python<'_>,
         visited: PyReadonlyArray3<'_, bool>,
         robots: PyReadonlyArray3<'_, i64>,
         n_hits: PyReadonlyArray1<'_, u32>,
         n_burning: PyReadonlyArray1<'_, u32>,
         states: Option<PyReadonlyArray3<'_, u8>>,
-    ) -> PyResult<()> {
+    ) {
         let (visited, robots) = (visited.as_array(), robots.as_array());
         let (n_hits, n_burning) = (n_hits.as_array(), n_burning.as_array());
         let states = states.as_ref().map(|states| states.as_array());
-        self.check(py, visited, robots, [n_hits, n_burning], states)?;
-        for (world, tally) in self.worlds.iter_mut().enumerate() {
+        for (world, tally) in self.0.iter_mut().enumerate() {
             let visited = visited.index_axis(Axis(0), world);
             let robots = robots.index_axis(Axis(0), world);
             let found = Found {
@@ -63,50 +50,17 @@ impl MeritTally {
             let states = states.map(|states| states.as_standard_layout().into_owned());
             tally.update(&flights(visited, robots), found, states.as_ref());
         }
-        Ok(())
     }
 
-    /// Returns the figures of one world over its steps so far.
-    fn merit(&self, world: usize) -> PyResult<Figures> {
-        let tally = self.worlds.get(world);
-        let tally = tally.ok_or_else(|| PyIndexError::new_err("no such world"))?;
-        let got = tally.merit();
-        Ok((
+    fn merit(&self, world: usize) -> Figures {
+        let got = self.0[world].merit();
+        (
             got.steps_to_detection,
             got.burning_cells_at_detection,
             got.burning_seen_share,
             got.front_distance,
             got.grid_seen_share,
-        ))
-    }
-}
-
-impl MeritTally {
-    /// Checks that the shapes of the arrays match, and that the robots are on the grid.
-    fn check(
-        &self,
-        py: Python<'_>,
-        visited: ArrayView3<'_, bool>,
-        robots: ArrayView3<'_, i64>,
-        counts: [ArrayView1<'_, u32>; 2],
-        states: Option<ArrayView3<'_, u8>>,
-    ) -> PyResult<()> {
-        let (height, width) = self.shape.dim();
-        let grids = (self.worlds.len(), height, width);
-        let (n_worlds, _, n_axes) = robots.dim();
-        let is_on_grid = |cell: ArrayView1<'_, i64>| {
-            (0..height as i64).contains(&cell[0]) && (0..width as i64).contains(&cell[1])
-        };
-        let fits = visited.dim() == grids
-            && states.is_none_or(|states| states.dim() == grids)
-            && counts.iter().all(|counts| counts.len() == grids.0)
-            && (n_worlds, n_axes) == (grids.0, 2)
-            && robots.rows().into_iter().all(is_on_grid);
-        if fits {
-            return Ok(());
-        }
-        let expected = format!("arrays of {} worlds of {}", grids.0, self.shape);
-        Err(invalid(py, "step", expected, "others"))
+        )
     }
 }
 

@@ -1,10 +1,11 @@
 //! Model files and descriptions, read for Python's `Model` and `Description`.
 
+use crate::airspace;
 use crate::refusal::invalid;
 use emberwatch_model::grid::{MAX_SIDE, Shape};
 use emberwatch_model::hazards::Hazards;
 use emberwatch_model::task::Task;
-use emberwatch_model::{CellMap, Description, Model, parse_color};
+use emberwatch_model::{CellMap, Description, Model};
 use emberwatch_sim::states_file::StatesFile;
 use numpy::ToPyArray;
 use pyo3::exceptions::PyValueError;
@@ -12,8 +13,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use std::collections::BTreeMap;
 
-/// Returns the text of each built-in file of a kind, by name. Kinds: `"models"`, `"tasks"`, and `"states"`, which are
-/// descriptions of recorded states.
+/// Returns the texts of built-in files by name. `"states"` are descriptions of recorded states.
 #[pyfunction]
 pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &'static str>> {
     match kind {
@@ -24,7 +24,6 @@ pub fn built_in(py: Python<'_>, kind: &str) -> PyResult<BTreeMap<&'static str, &
     }
 }
 
-/// Parses the text of a model file, and returns the model's fields by name.
 #[pyfunction]
 pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = model_of(text)?;
@@ -43,36 +42,25 @@ pub fn read_model<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDic
     Ok(fields)
 }
 
-/// Returns the text of a model file with its sensor radius replaced. The radius is in rows and columns beyond the path.
+/// Returns the text of a model file or a description with another sensor radius, in rows and columns.
 #[pyfunction]
-pub fn model_with_radius(text: &str, radius: usize) -> PyResult<String> {
-    let model = model_of(text)?.with_radius(radius).map_err(refused)?;
-    toml::to_string(model.file()).map_err(refused)
+pub fn with_radius(text: &str, radius: i64) -> PyResult<String> {
+    let mut file: toml::Table = toml::from_str(text).map_err(refused)?;
+    let sensor = toml::Table::from_iter([("radius".into(), radius.into())]);
+    file.insert("sensor".into(), sensor.into());
+    toml::to_string(&file).map_err(refused)
 }
 
-/// Returns the text of a description with its sensor radius replaced.
-#[pyfunction]
-pub fn description_with_radius(text: &str, radius: usize) -> PyResult<String> {
-    let mut description: Description = toml::from_str(text).map_err(refused)?;
-    let model = description.unchanging().map_err(refused)?;
-    let model = model.with_radius(radius).map_err(refused)?;
-    description.sensor = model.file().sensor.clone();
-    toml::to_string(&description).map_err(refused)
-}
-
-/// Returns the fields of a description of recorded worlds, by name.
 #[pyfunction]
 pub fn read_description<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyDict>> {
     let model = Description::model_of(text).map_err(refused)?;
     described(py, &model)
 }
 
-/// Parses a model from the text of a model file.
 pub fn model_of(text: &str) -> PyResult<Model> {
     Model::from_toml(text).map_err(refused)
 }
 
-/// Returns the shape of a grid. Raises an error if a side is out of range.
 pub fn shape_of(py: Python<'_>, height: usize, width: usize) -> PyResult<Shape> {
     let expected = format!("height and width within 1 to {MAX_SIDE}");
     let got = format!("{height} x {width}");
@@ -91,40 +79,18 @@ fn described<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>
     fields.set_item("name", model.name())?;
     let names: Vec<_> = states.clone().map(|it| &it.name).collect();
     fields.set_item("state_names", PyTuple::new(py, names)?)?;
-    fields.set_item("state_colors", colors(py, states.map(|it| &it.color))?)?;
-    fields.set_item(
-        "observation_names",
-        PyTuple::new(py, model.observation_names())?,
-    )?;
-    fields.set_item(
-        "observation_colors",
-        colors(py, observations.map(|it| &it.color))?,
-    )?;
+    let colors: Vec<_> = states.map(|it| &it.color).collect();
+    fields.set_item("state_colors", colors)?;
+    let names = PyTuple::new(py, model.observation_names())?;
+    fields.set_item("observation_names", names)?;
+    let colors: Vec<_> = observations.map(|it| &it.color).collect();
+    fields.set_item("observation_colors", colors)?;
     fields.set_item("observation_matrix", model.likelihood().to_pyarray(py))?;
     fields.set_item("reward", model.reward().to_pyarray(py))?;
-    fields.set_item("airspace", airspace(py, model)?)?;
-    Ok(fields)
-}
-
-/// Returns the fields of Python's `Airspace`.
-fn airspace<'py>(py: Python<'py>, model: &Model) -> PyResult<Bound<'py, PyDict>> {
-    let fields = PyDict::new(py);
-    fields.set_item("radius", model.radius())?;
-    let no_fly = model.file().no_fly.as_ref().map(CellMap::grid);
+    let no_fly = file.no_fly.as_ref().map(CellMap::grid);
     let no_fly = no_fly.map(|map| map.expect("invariant: a model's maps are checked"));
-    let no_fly = no_fly.map(|map| map.mapv(|flag| flag != 0).to_pyarray(py));
-    fields.set_item("no_fly", no_fly)?;
+    let no_fly = no_fly.map(|map| map.mapv(|flag| flag != 0));
+    let airspace = airspace::python(py, model.radius(), no_fly.as_ref())?;
+    fields.set_item("airspace", airspace)?;
     Ok(fields)
-}
-
-fn colors<'a, 'py>(
-    py: Python<'py>,
-    of: impl Iterator<Item = &'a String>,
-) -> PyResult<Bound<'py, PyTuple>> {
-    let color = |text: &String| {
-        let [red, green, blue] =
-            parse_color(text).expect("invariant: a model's colours are checked");
-        (red, green, blue)
-    };
-    PyTuple::new(py, of.map(color).collect::<Vec<_>>())
 }

@@ -16,8 +16,7 @@ pub fn paths(given: &Bound<'_, PyAny>, n_robots: usize, n_moves: usize) -> Optio
     check_moves(&moves).is_ok().then_some(moves)
 }
 
-/// Converts an array of choices, one per row, to bytes. Returns `None` unless it is a plain `int64` array of values from
-/// 0 to `n_choices - 1`.
+/// Converts choices, one per row; returns `None` unless they are a plain `int64` array of values below `n_choices`.
 #[pyfunction]
 pub fn choices<'py>(
     given: &Bound<'py, PyAny>,

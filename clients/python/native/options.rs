@@ -23,10 +23,8 @@ use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
 use std::sync::OnceLock;
 
-/// The features and the paths of plans.
 type Plans<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<u8>>);
 
-/// Returns the names of the options, and the names of the features that describe each plan.
 #[pyfunction]
 pub fn option_names() -> (Vec<&'static str>, Vec<String>) {
     (
@@ -54,13 +52,10 @@ struct Text {
     toml: String,
 }
 
-/// Beliefs about many worlds, and the plans of all options in each.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Options {
-    /// Name of the estimator that computes the beliefs.
     #[pyo3(get)]
     estimator: String,
-    /// The kind of the first belief, and the model that it is computed from.
     first: (Prior, Model),
     prior: OnceLock<Belief>,
     worlds: Owned<PlannedWorlds>,
@@ -149,7 +144,6 @@ impl Options {
         })
     }
 
-    /// Returns the kind and the bytes of the belief about a world, for the next client.
     fn left(&self, py: Python<'_>, world: usize) -> PyResult<Option<(String, Vec<u8>)>> {
         self.worlds.with(py, |worlds| {
             let agent = worlds.world(world)?.agent();
@@ -157,7 +151,7 @@ impl Options {
         })
     }
 
-    /// Updates the belief about a world with an earlier step: its result, and its frame, `[1, H, W]`.
+    /// `result` and `frame`, `[1, H, W]`, are of an earlier step.
     fn recall(
         &self,
         py: Python<'_>,
@@ -170,7 +164,7 @@ impl Options {
         recalled?.map_err(|error| raise(py, &error))
     }
 
-    /// Updates the beliefs about the worlds marked in `chosen` with a step. `frames`, `[n, H, W]`, has all worlds.
+    /// `frames` has the shape `[n, H, W]`.
     fn update(
         &self,
         py: Python<'_>,
@@ -186,8 +180,7 @@ impl Options {
         seen?.map_err(|error| raise(py, &error))
     }
 
-    /// Plans all options in the worlds marked in `chosen`. Returns features `[n_worlds, options, features]` and paths
-    /// `[n_worlds, options, T]` of all worlds.
+    /// Returns features `[n_worlds, options, features]` and paths `[n_worlds, options, T]`, also of worlds that do not plan.
     fn plan<'py>(
         &self,
         py: Python<'py>,
@@ -195,8 +188,7 @@ impl Options {
         results: PyReadonlyArray1<'_, u8>,
     ) -> PyResult<Plans<'py>> {
         let (chosen, results) = (chosen.as_slice()?, results.as_slice()?);
-        let plans = self.worlds.with(py, |it| it.plan(chosen, results))?;
-        let (features, paths) = plans.map_err(|error| raise(py, &error))?;
+        let (features, paths) = self.worlds.with(py, |it| it.plan(chosen, results))?;
         Ok((features.into_pyarray(py), paths.into_pyarray(py)))
     }
 

@@ -21,7 +21,6 @@ use std::path::PathBuf;
 /// Memory of the tables of a small model, in bytes.
 const TABLE_BYTES: usize = 4096;
 
-/// The kind and the sources of beliefs.
 pub struct Origin {
     pub kind: &'static BeliefKind,
     pub model: Option<Model>,
@@ -37,22 +36,16 @@ pub struct Origin {
 /// The fields of Python's `Kind`.
 type Facts = (&'static str, bool, bool, bool);
 
-/// Returns the name and the facts of each kind of belief that is corrected with frames.
 #[pyfunction]
 pub fn belief_kinds() -> Vec<(&'static str, Facts)> {
     let facts = |it: &BeliefKind| {
-        (
-            it.about,
-            it.knows_model,
-            it.learned_by.is_some(),
-            it.has_options,
-        )
+        let is_learned = it.learned_by.is_some();
+        (it.about, it.knows_model, is_learned, it.has_options)
     };
-    of_frames().map(|kind| (kind.name, facts(kind))).collect()
+    of_frames().map(|it| (it.name, facts(it))).collect()
 }
 
 impl Origin {
-    /// Creates the source of beliefs with a known model, whose first belief is `prior`.
     pub fn known(
         py: Python<'_>,
         model_text: &str,
@@ -75,7 +68,6 @@ impl Origin {
         })
     }
 
-    /// Creates the source of beliefs from the bytes of a checkpoint, which `name` names in errors.
     pub fn learned(
         py: Python<'_>,
         name: &str,
@@ -105,7 +97,6 @@ impl Origin {
         })
     }
 
-    /// Reads the sources of a saved belief.
     pub fn saved(py: Python<'_>, saved: &Saved<'_>) -> PyResult<Self> {
         let is_learned = !saved.checkpoint.is_empty();
         let shape = shape_of(py, saved.dim.1, saved.dim.2)?;
@@ -122,7 +113,6 @@ impl Origin {
         Self::known(py, model, prior, kind)
     }
 
-    /// Warns if the values were learned in worlds with other names than the model's.
     pub fn warn_of_other_worlds(&self, py: Python<'_>) -> PyResult<()> {
         let names = self.model.as_ref().map(WorldNames::of);
         let warning = names.and_then(|names| self.learned.warning_in(&names));
@@ -138,16 +128,11 @@ impl Origin {
         }
     }
 
-    /// Builds the belief about one world before the first frame.
     pub fn estimator(&self) -> anyhow::Result<Box<dyn Estimator>> {
         (self.kind.build)(&self.conditions())
     }
 
-    /// Builds the beliefs about `n_worlds` worlds, each with `n_states` states.
-    ///
-    /// # Errors
-    /// If there is not enough memory, if the model or checkpoint provides no belief on this grid, or if a signal handler
-    /// raises an exception.
+    /// Builds the beliefs about `n_worlds` worlds, each with `n_states` states. Signals interrupt it.
     pub fn estimators(
         &self,
         py: Python<'_>,
@@ -214,7 +199,6 @@ fn of_frames() -> impl Iterator<Item = &'static BeliefKind> {
     kinds.filter(|kind| kind.input == Input::Frames)
 }
 
-/// Finds a kind of belief by its name, either among the learned kinds or among the kinds that need only a model.
 pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static BeliefKind> {
     let kinds = || of_frames().filter(|kind| kind.learned_by.is_some() == is_learned);
     // Text that UTF-8 cannot encode is treated as an unknown name.
@@ -227,7 +211,6 @@ pub fn kind_of(name: &Bound<'_, PyAny>, is_learned: bool) -> PyResult<&'static B
     Err(invalid(name.py(), "kind", expected, name.repr()?))
 }
 
-/// Creates the exception for a model or a checkpoint from which no belief can be built.
 pub fn unfit(py: Python<'_>, error: &anyhow::Error) -> PyErr {
     refused(py, format!("{error:#}"))
 }

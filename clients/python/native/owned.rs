@@ -22,14 +22,12 @@ pub struct Owned<T: Send> {
     freed: Condvar,
 }
 
-enum Slot<T> {
-    Free(T),
-    /// This thread is using the value.
-    Taken(ThreadId),
-    Closed,
+/// Without value and thread, it is closed.
+struct Slot<T> {
+    value: Option<T>,
+    user: Option<ThreadId>,
 }
 
-/// The reason why a thread could not take the value.
 enum Untaken {
     /// A signal handler raised an exception during the wait.
     Interrupted,
@@ -37,11 +35,21 @@ enum Untaken {
     Own,
 }
 
+impl<T> Slot<T> {
+    fn take(&mut self) -> Option<T> {
+        let value = self.value.take();
+        if value.is_some() {
+            self.user = Some(this_thread());
+        }
+        value
+    }
+}
+
 fn this_thread() -> ThreadId {
     std::thread::current().id()
 }
 
-/// A guard of a value that a thread is using. Dropping the guard frees the value for other threads.
+/// The value while this thread uses it. Dropping this frees it for other threads.
 struct Taken<'a, T: Send> {
     owner: &'a Owned<T>,
     value: Option<T>,
@@ -49,18 +57,16 @@ struct Taken<'a, T: Send> {
 
 impl<T: Send> Owned<T> {
     pub fn new(instance: &str, value: T) -> Self {
+        let (value, user) = (Some(value), None);
         Self {
             pid: pid(),
             instance: instance.into(),
-            slot: ManuallyDrop::new(Mutex::new(Slot::Free(value))),
+            slot: ManuallyDrop::new(Mutex::new(Slot { value, user })),
             freed: Condvar::new(),
         }
     }
 
     /// Uses the value with the interpreter lock released, so that other threads can run.
-    ///
-    /// # Errors
-    /// If the value is closed, if another process made it, or if the wait for other threads was interrupted.
     pub fn with<R: Send>(
         &self,
         py: Python<'_>,
@@ -68,8 +74,8 @@ impl<T: Send> Owned<T> {
     ) -> PyResult<R> {
         self.check(py)?;
         let outcome = py.detach(|| {
-            let mut taken = self.take()?;
-            Ok(taken.value.as_mut().map(act))
+            let taken = self.take(interrupted)?;
+            Ok(taken.map(|value| act(self.taken(value).value_mut())))
         });
         match outcome {
             Ok(Some(outcome)) => Ok(outcome),
@@ -84,9 +90,6 @@ impl<T: Send> Owned<T> {
     /// Uses the value for short work. Unlike [`Self::with`], keeps the interpreter locked unless another thread uses
     /// the value. Detects only forks that run Python's hooks, so call [`Self::check`] first if several threads share
     /// the work.
-    ///
-    /// # Errors
-    /// As for [`Self::with`].
     pub fn with_briefly<R: Send>(
         &self,
         py: Python<'_>,
@@ -95,28 +98,14 @@ impl<T: Send> Owned<T> {
         if self.pid != known_pid() {
             self.check(py)?;
         }
-        let taken = match &mut *self.lock() {
-            slot @ Slot::Free(_) => match std::mem::replace(slot, Slot::Taken(this_thread())) {
-                Slot::Free(value) => Some(value),
-                _ => None,
-            },
-            _ => None,
-        };
-        match taken {
-            Some(value) => {
-                let value = Some(value);
-                let mut taken = Taken { owner: self, value };
-                let value = taken.value.as_mut().expect("invariant: just taken");
-                Ok(act(value))
-            }
+        let free = self.lock().take();
+        match free {
+            Some(value) => Ok(act(self.taken(value).value_mut())),
             None => self.with(py, act),
         }
     }
 
     /// Drops the value. Does nothing in another process, or if it is closed already.
-    ///
-    /// # Errors
-    /// If the wait for other threads was interrupted; the value is still open.
     pub fn close(&self, py: Python<'_>) -> PyResult<()> {
         if self.pid != pid() {
             return Ok(());
@@ -138,7 +127,6 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Refuses any process except the one that made the value.
     pub fn check(&self, py: Python<'_>) -> PyResult<()> {
         if self.pid == pid() {
             return Ok(());
@@ -153,7 +141,6 @@ impl<T: Send> Owned<T> {
         Err(error(py, "EmberwatchError", (text, "forked")))
     }
 
-    /// Returns the beginning of an error message: the subject, and its verb in the singular or plural.
     fn subject(&self, singular: &str, plural: &str) -> String {
         if self.instance == INSTANCE {
             format!("these worlds {plural}")
@@ -162,64 +149,34 @@ impl<T: Send> Owned<T> {
         }
     }
 
-    /// Waits until no other thread uses the value, then takes it.
-    fn take(&self) -> Result<Taken<'_, T>, Untaken> {
-        let mut slot = self.lock();
+    /// Waits until no other thread uses the value, unless `stops` ends the wait, then takes it. Returns `None` if it is
+    /// closed.
+    fn take(&self, stops: fn() -> bool) -> Result<Option<T>, Untaken> {
         loop {
-            match std::mem::replace(&mut *slot, Slot::Taken(this_thread())) {
-                Slot::Free(value) => {
-                    return Ok(Taken {
-                        owner: self,
-                        value: Some(value),
-                    });
-                }
-                Slot::Closed => {
-                    *slot = Slot::Closed;
-                    return Ok(Taken {
-                        owner: self,
-                        value: None,
-                    });
-                }
-                Slot::Taken(by) => {
-                    *slot = Slot::Taken(by);
-                    if by == this_thread() {
-                        return Err(Untaken::Own);
-                    }
-                    self.wait(slot);
-                    if interrupted() {
-                        return Err(Untaken::Interrupted);
-                    }
-                    slot = self.lock();
-                }
+            let mut slot = self.lock();
+            match slot.user {
+                None => return Ok(slot.take()),
+                Some(user) if user == this_thread() => return Err(Untaken::Own),
+                Some(_) => self.wait(slot),
+            }
+            if stops() {
+                return Err(Untaken::Interrupted);
             }
         }
     }
 
-    /// Waits until no thread uses the value, then drops it, unless `stops` ends the wait.
+    fn taken(&self, value: T) -> Taken<'_, T> {
+        let value = Some(value);
+        Taken { owner: self, value }
+    }
+
     fn end(&self, stops: fn() -> bool) -> Result<(), Untaken> {
-        let mut slot = self.lock();
-        loop {
-            match std::mem::replace(&mut *slot, Slot::Closed) {
-                Slot::Free(value) => {
-                    drop(slot);
-                    self.freed.notify_all();
-                    drop(value);
-                    return Ok(());
-                }
-                Slot::Closed => return Ok(()),
-                Slot::Taken(by) => {
-                    *slot = Slot::Taken(by);
-                    if by == this_thread() {
-                        return Err(Untaken::Own);
-                    }
-                    self.wait(slot);
-                    if stops() {
-                        return Err(Untaken::Interrupted);
-                    }
-                    slot = self.lock();
-                }
-            }
+        if let Some(value) = self.take(stops)? {
+            self.lock().user = None;
+            self.freed.notify_all();
+            drop(value);
         }
+        Ok(())
     }
 
     /// Waits until the value is free, but at most one interval, because a thread that stopped waiting may have consumed
@@ -234,12 +191,17 @@ impl<T: Send> Owned<T> {
     }
 }
 
+impl<T: Send> Taken<'_, T> {
+    fn value_mut(&mut self) -> &mut T {
+        self.value.as_mut().expect("invariant: until it is dropped")
+    }
+}
+
 impl<T: Send> Drop for Taken<'_, T> {
     fn drop(&mut self) {
-        if let Some(value) = self.value.take() {
-            *self.owner.lock() = Slot::Free(value);
-            self.owner.freed.notify_all();
-        }
+        let (value, user) = (self.value.take(), None);
+        *self.owner.lock() = Slot { value, user };
+        self.owner.freed.notify_all();
     }
 }
 
@@ -276,7 +238,6 @@ fn known_pid() -> u32 {
     }
 }
 
-/// Clears the cached process id in a forked child.
 pub fn forget_pid() {
     PID.store(0, Ordering::Relaxed);
 }

@@ -6,7 +6,7 @@
 use crate::answer::RESULT_BYTES;
 use crate::origin::is_short;
 use crate::threads::{Pool, Threads};
-use anyhow::{Result, ensure};
+use anyhow::Result;
 use emberwatch_acting::options::{OptionAgent, OptionSetup, Shown};
 use emberwatch_belief::Belief;
 use emberwatch_belief::planning::OPTIONS;
@@ -17,15 +17,12 @@ use emberwatch_model::Frame;
 use emberwatch_model::path::path_to_bytes;
 use numpy::ndarray::{Array3, ArrayView1, s};
 
-/// Beliefs and plans of many worlds.
 pub struct PlannedWorlds {
     pub setup: OptionSetup,
-    /// `None` before a world's first episode.
     worlds: Vec<Option<OptionAgent>>,
     threads: Pool,
 }
 
-/// A world, and the result and the frame of its step.
 type Seen<'a> = (&'a mut OptionAgent, &'a [u8], &'a [u8]);
 
 impl PlannedWorlds {
@@ -37,22 +34,17 @@ impl PlannedWorlds {
         }
     }
 
-    /// Returns the world with this number, if an episode has begun there.
     pub fn world(&mut self, world: usize) -> Option<&mut OptionAgent> {
         self.worlds.get_mut(world)?.as_mut()
     }
 
     /// Begins episodes with a first belief: either in all chosen worlds, or in none.
-    ///
-    /// # Errors
-    /// If the arrays differ in length, or if a belief cannot be built.
     pub fn start_episodes(
         &mut self,
         chosen: &[bool],
         results: &[u8],
         prior: &Belief,
     ) -> Result<()> {
-        self.check(chosen, results, None)?;
         let rows = results.chunks_exact(RESULT_BYTES).zip(chosen).enumerate();
         let rows = rows.filter(|(_, (_, chosen))| **chosen);
         let seeds = rows.map(|(world, (result, _))| (world, parsed(result).0.seed));
@@ -68,11 +60,7 @@ impl PlannedWorlds {
     }
 
     /// Updates the beliefs about the chosen worlds with a step. A world whose belief refuses its frame stays unchanged.
-    ///
-    /// # Errors
-    /// If the arrays differ in length, or a belief refuses its frame.
     pub fn update(&mut self, chosen: &[bool], results: &[u8], frames: &[u8]) -> Result<()> {
-        self.check(chosen, results, Some(frames))?;
         let frames = frames.chunks_exact(self.setup.shape().n_cells());
         let rows = results.chunks_exact(RESULT_BYTES).zip(frames).zip(chosen);
         let seen = self.worlds.iter_mut().zip(rows);
@@ -86,12 +74,8 @@ impl PlannedWorlds {
             .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Updates the belief about one world with an earlier step: its result and its frame, `[1, H, W]`.
-    ///
-    /// # Errors
-    /// As for [`Self::update`].
+    /// `result` and `frame` are of an earlier step.
     pub fn recall(&mut self, world: usize, result: &[u8], frame: &[u8]) -> Result<()> {
-        ensure!(result.len() == RESULT_BYTES, "options: expected one result");
         let Some(planned) = self.worlds.get_mut(world).and_then(Option::as_mut) else {
             return Ok(());
         };
@@ -101,13 +85,9 @@ impl PlannedWorlds {
             .work(is_short, |threads| update(setup, seen, threads))
     }
 
-    /// Plans all options in the chosen worlds. Returns features `[n_worlds, options, features]` and paths
-    /// `[n_worlds, options, T]` of the last plans of all worlds.
-    ///
-    /// # Errors
-    /// If the arrays differ in length.
-    pub fn plan(&mut self, chosen: &[bool], results: &[u8]) -> Result<(Array3<f32>, Array3<u8>)> {
-        self.check(chosen, results, None)?;
+    /// Plans in the chosen worlds. Returns the last plans of all worlds: features `[n_worlds, options, features]` and
+    /// paths `[n_worlds, options, T]`.
+    pub fn plan(&mut self, chosen: &[bool], results: &[u8]) -> (Array3<f32>, Array3<u8>) {
         let rows = results.chunks_exact(RESULT_BYTES).zip(chosen);
         let planning = self.worlds.iter_mut().zip(rows);
         let planning = planning.filter_map(|(planned, (result, &chosen))| {
@@ -121,7 +101,7 @@ impl PlannedWorlds {
         self.threads.work(is_short, |threads| {
             threads.each(planning, |(planned, robot)| planned.plan(robot))
         });
-        Ok(self.plans())
+        self.plans()
     }
 
     fn plans(&self) -> (Array3<f32>, Array3<u8>) {
@@ -141,20 +121,8 @@ impl PlannedWorlds {
         }
         (features, paths)
     }
-
-    fn check(&self, chosen: &[bool], results: &[u8], frames: Option<&[u8]>) -> Result<()> {
-        let (n_worlds, n_cells) = (self.worlds.len(), self.setup.shape().n_cells());
-        ensure!(
-            chosen.len() == n_worlds
-                && results.len() == n_worlds * RESULT_BYTES
-                && frames.is_none_or(|it| it.len() == n_worlds * n_cells),
-            "options: expected a result and a frame for each of {n_worlds} worlds, got other lengths"
-        );
-        Ok(())
-    }
 }
 
-/// Corrects and predicts the beliefs.
 fn update(setup: &OptionSetup, mut seen: Vec<Seen<'_>>, threads: Threads) -> Result<()> {
     let corrected = threads.each(&mut seen, |(planned, result, frame)| {
         let (world, robot) = parsed(result);

@@ -13,8 +13,7 @@ use numpy::ndarray::{Array2, ArrayView1};
 use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
 
-/// Maximum memory of a beam, in bytes.
-const MAX_BYTES: usize = 1 << 32;
+const MAX_BEAM_BYTES: usize = 1 << 32;
 
 /// Plans a path for each world. `values`, `[n, H, W]`, are finite; `robots` has shape `[n, 2]`; `keys`, `[n]`, break
 /// ties. Python has checked that `n_moves` and `width` are in range.
@@ -68,7 +67,6 @@ pub fn beam_search<'py>(
     Ok(paths.into_pyarray(py))
 }
 
-/// Checks that the beam's memory is within the limit and available.
 fn check(
     py: Python<'_>,
     shape: Shape,
@@ -79,7 +77,7 @@ fn check(
     let set_bytes = (reach(shape.height()) * reach(shape.width())).div_ceil(64) * 8;
     // Each state has two sets of cells, for before and after a move, and one link per move to the previous state.
     let state_bytes = 2 * set_bytes + n_moves * 8;
-    let widest = MAX_BYTES / state_bytes;
+    let widest = MAX_BEAM_BYTES / state_bytes;
     if width > widest {
         let expected = format!("an integer within 1 to {widest}");
         return Err(invalid(py, "width", expected, width));

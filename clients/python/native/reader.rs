@@ -14,42 +14,42 @@ use pyo3::types::PyTuple;
 /// Seconds that an iteration without a timeout waits at a time, because an infinite wait would overflow.
 const HOUR: f64 = 3600.0;
 
-/// Observes an instance. Returns an iterator of frames, which is also a context manager.
-///
-/// The server publishes the current frame of every world when an observer connects, so the same
-/// step of the same episode may arrive twice.
-///
-/// Args:
-///     instance: The instance's name. Its server may start later.
-///     world: The only world to observe; None: all worlds.
-///     timeout: Seconds without a frame after which the iteration ends; None: it never ends.
-#[pyfunction]
-#[pyo3(signature = (instance="default", *, world=None, timeout=None))]
-pub fn observe(
-    py: Python<'_>,
-    instance: &str,
-    world: Option<Number>,
-    timeout: Option<f64>,
-) -> PyResult<Observer> {
-    Observer::new(py, instance, world, timeout)
-}
-
 macro_rules! reader {
-    ($(#[$doc:meta])* $name:ident, $header:ty, $open:path, $record:path, {$($new:tt)*}) => {
+    ($(#[$doc:meta])* $name:ident, $header:ty, $open:path, $record:path) => {
         $(#[$doc])*
         #[pyclass(frozen, subclass, weakref, dict, module = "emberwatch")]
         pub struct $name {
             #[pyo3(get)]
             instance: String,
             subscriber: Owned<Subscriber<$header>>,
-            /// The only world whose samples are returned; `None` for all worlds.
             world: Option<u32>,
             timeout: Option<f64>,
         }
 
         #[pymethods]
         impl $name {
-            $($new)*
+            #[new]
+            #[pyo3(signature = (instance="default", *, world=None, timeout=None))]
+            fn new(
+                py: Python<'_>,
+                instance: &str,
+                world: Option<Number>,
+                timeout: Option<f64>,
+            ) -> PyResult<Self> {
+                if let Some(got) = timeout.filter(|it| it.is_nan() || *it < 0.0) {
+                    let expected = "seconds of at least 0, or None";
+                    return Err(invalid(py, "timeout", expected, got));
+                }
+                let name = checked(py, instance)?;
+                let subscriber = py.detach(|| $open(&name));
+                let subscriber = subscriber.map_err(|error| raise_of_channel(py, error))?;
+                Ok(Self {
+                    instance: instance.into(),
+                    subscriber: Owned::new(instance, subscriber),
+                    world: world.map(|it| it.0),
+                    timeout,
+                })
+            }
 
             /// Returns the next sample; None if none arrives within `timeout` seconds.
             fn receive<'py>(
@@ -95,25 +95,6 @@ macro_rules! reader {
                 self.close(py)
             }
         }
-
-        impl $name {
-            fn open(
-                py: Python<'_>,
-                instance: &str,
-                world: Option<Number>,
-                timeout: Option<f64>,
-            ) -> PyResult<Self> {
-                let name = checked(py, instance)?;
-                let subscriber = py.detach(|| $open(&name));
-                let subscriber = subscriber.map_err(|error| raise_of_channel(py, error))?;
-                Ok(Self {
-                    instance: instance.into(),
-                    subscriber: Owned::new(instance, subscriber),
-                    world: world.map(|it| it.0),
-                    timeout,
-                })
-            }
-        }
     };
 }
 
@@ -121,48 +102,23 @@ reader! {
     /// A reader of the frames of an instance: one `Frame` for each step of each world.
     ///
     /// Iterate over it, or call `receive`. A slow reader loses samples; it never delays the server.
-    Observer, FrameHeader, Subscriber::frames, records::frame, {
-        /// Subscribes; see `observe`.
-        #[new]
-        #[pyo3(signature = (instance="default", *, world=None, timeout=None))]
-        fn new(
-            py: Python<'_>,
-            instance: &str,
-            world: Option<Number>,
-            timeout: Option<f64>,
-        ) -> PyResult<Self> {
-            if let Some(got) = timeout.filter(|it| it.is_nan() || *it < 0.0) {
-                let expected = "seconds of at least 0, or None";
-                return Err(invalid(py, "timeout", expected, got));
-            }
-            Self::open(py, instance, world, timeout)
-        }
-    }
+    /// The server publishes the current frame of every world when an observer connects, so the same
+    /// step of the same episode may arrive twice.
+    ///
+    /// The server of the instance may start later. `world` is the only world to observe; None: all.
+    /// The iteration ends after `timeout` seconds without a frame; None: never.
+    Observer, FrameHeader, Subscriber::frames, records::frame
 }
 
 reader! {
     /// A reader of the hidden states of an instance, if its server publishes them: one `Truth` for
-    /// each step of each world.
-    ///
-    /// A slow reader loses samples; it never delays the server.
-    TruthReader, TruthHeader, Subscriber::truth, records::truth, {
-        #[new]
-        #[pyo3(signature = (instance="default"))]
-        fn new(py: Python<'_>, instance: &str) -> PyResult<Self> {
-            Self::open(py, instance, None, None)
-        }
-    }
+    /// each step of each world. Otherwise as `Observer`.
+    TruthReader, TruthHeader, Subscriber::truth, records::truth
 }
 
 reader! {
-    /// A reader of the beliefs of the agents of an instance, as `Outlook`.
+    /// A reader of the beliefs of the agents of an instance, as `Outlook`. Otherwise as `Observer`.
     ///
-    /// Agents publish their beliefs only while there is a reader. A slow reader loses samples.
-    OutlookReader, AgentHeader, Subscriber::agents, records::outlook, {
-        #[new]
-        #[pyo3(signature = (instance="default"))]
-        fn new(py: Python<'_>, instance: &str) -> PyResult<Self> {
-            Self::open(py, instance, None, None)
-        }
-    }
+    /// Agents publish their beliefs only while there is a reader.
+    OutlookReader, AgentHeader, Subscriber::agents, records::outlook
 }

@@ -11,7 +11,6 @@ use std::io::BufReader;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-/// An open recording.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct Recording {
     name: String,
@@ -36,9 +35,12 @@ impl Recording {
         })
     }
 
-    /// Returns the next record's nanoseconds since the recording began and its `Frame`, `Truth` or
-    /// `ServerInfo`; None at the end.
-    fn read<'py>(&self, py: Python<'py>) -> PyResult<Option<(u64, Bound<'py, PyAny>)>> {
+    fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    /// Returns nanoseconds since the recording began, and a `Frame`, `Truth` or `ServerInfo`.
+    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<(u64, Bound<'py, PyAny>)>> {
         let record = py.detach(|| {
             let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
             reader.next()
@@ -71,7 +73,6 @@ fn raise(py: Python<'_>, name: &str, problem: RecordingError) -> PyErr {
     error(py, "EmberwatchError", (text, code))
 }
 
-/// Creates the exception for a file that the system could not read.
 fn unread(name: &str, error: &std::io::Error) -> PyErr {
     match error.raw_os_error() {
         Some(code) => PyOSError::new_err((code, error.to_string(), name.to_owned())),

@@ -1,6 +1,7 @@
 //! Makes the records of `emberwatch/client` (frozen dataclasses and named tuples in Python, which say what each field
 //! means) from replies, published samples and results.
 
+use crate::airspace;
 use crate::errors::bad_answer;
 use emberwatch_messages::agent_belief::AgentBelief;
 use emberwatch_messages::control::{ServerInfo, ServerStatus, WorldInfo};
@@ -11,14 +12,13 @@ use emberwatch_messages::message::{
 use emberwatch_messages::payload::{split_frame_payload, truth_states};
 use emberwatch_messages::sample::Sample;
 use emberwatch_model::Grid;
-use numpy::{IntoPyArray, PyArray1, PyArrayMethods, ToPyArray};
+use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::IntoPyObjectExt;
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyTuple};
 use serde::Serialize;
 use serde_json::Value;
 
-/// Returns an array of bytes as an array of results; `dtype` is a name in `emberwatch/client/wire.py`.
 pub fn view<'py>(bytes: &Bound<'py, PyArray1<u8>>, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
     bytes.call_method1("view", (of(bytes.py(), "wire", dtype)?,))
 }
@@ -33,34 +33,21 @@ pub fn step_result<'py>(
 }
 
 fn world_result<'py>(py: Python<'py>, it: &WorldResult) -> PyResult<Bound<'py, PyAny>> {
-    of(py, "wire", "WorldResult")?.call1((
-        it.step,
-        it.seed,
-        it.episode,
-        it.reward,
-        it.hovered,
-        it.late,
-        it.n_target_cells,
-        it.n_visited,
-        it.n_hits,
-        it.terminated,
-        it.truncated,
-    ))
+    unpacked(py, "WorldResult", "WORLD", bytemuck::bytes_of(it))
 }
 
 fn robot_result<'py>(py: Python<'py>, it: &RobotResult) -> PyResult<Bound<'py, PyAny>> {
-    of(py, "wire", "RobotResult")?.call1((
-        it.reward,
-        it.marginal,
-        it.n_visited,
-        it.n_hits,
-        it.start_row,
-        it.start_col,
-        it.row,
-        it.col,
-        it.coverage,
-        it.n_moves,
-    ))
+    unpacked(py, "RobotResult", "ROBOT", bytemuck::bytes_of(it))
+}
+
+fn unpacked<'py>(
+    py: Python<'py>,
+    class: &str,
+    layout: &str,
+    bytes: &[u8],
+) -> PyResult<Bound<'py, PyAny>> {
+    let fields = of(py, "wire", layout)?.call_method1("unpack", (bytes,))?;
+    of(py, "wire", class)?.call_method1("_make", (fields,))
 }
 
 pub fn server_info<'py>(py: Python<'py>, info: &ServerInfo) -> PyResult<Bound<'py, PyAny>> {
@@ -68,15 +55,9 @@ pub fn server_info<'py>(py: Python<'py>, info: &ServerInfo) -> PyResult<Bound<'p
     let airspace = info
         .airspace()
         .map_err(|problem| bad_answer(py, &problem))?;
-    let land = PyDict::new(py);
-    land.set_item("radius", airspace.radius())?;
-    if let Some(no_fly) = airspace.no_fly() {
-        land.set_item("no_fly", no_fly.to_pyarray(py))?;
-    }
-    let airspace = py
-        .import("emberwatch.model.airspace")?
-        .getattr("Airspace")?;
-    fields.set_item("airspace", airspace.call((), Some(&land))?)?;
+    let no_fly = airspace.no_fly().map(|map| &**map);
+    let airspace = airspace::python(py, airspace.radius(), no_fly)?;
+    fields.set_item("airspace", airspace)?;
     if let Some(recorded) = &info.recorded_world {
         fields.set_item("recorded_world", record(py, "RecordedWorld", recorded)?)?;
     }
@@ -91,7 +72,6 @@ pub fn status<'py>(py: Python<'py>, status: &ServerStatus) -> PyResult<Bound<'py
     made(py, "ServerStatus", &fields)
 }
 
-/// Returns a tuple of `WorldInfo`.
 pub fn worlds<'py>(py: Python<'py>, worlds: &[WorldInfo]) -> PyResult<Bound<'py, PyTuple>> {
     let worlds: PyResult<Vec<_>> = worlds
         .iter()
@@ -141,7 +121,6 @@ pub fn truth<'py>(
     truth_from(py, (header.world, moment), states, n_lost)
 }
 
-/// Returns the hidden states of a world in this process.
 pub fn truth_of<'py>(
     py: Python<'py>,
     world: u32,
@@ -197,7 +176,6 @@ pub fn outlook<'py>(
     sample_of(py, "Outlook", &fields)
 }
 
-/// Makes a reply's record from its JSON keys.
 fn record<'py>(
     py: Python<'py>,
     class: &str,
@@ -222,7 +200,6 @@ fn sample_of<'py>(
     of(py, "observer", class)?.call((), Some(fields))
 }
 
-/// Returns what a module of `emberwatch/client` calls `name`.
 pub fn of<'py>(py: Python<'py>, module: &str, name: &str) -> PyResult<Bound<'py, PyAny>> {
     py.import("emberwatch.client")?
         .getattr(module)?

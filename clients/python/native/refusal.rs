@@ -15,7 +15,6 @@ pub fn explain(status: u32, detail: u64) -> Option<(String, String)> {
     is_refusal.then_some((name.as_str()?.to_owned(), status.explain(detail)))
 }
 
-/// Creates an `InvalidArgumentError` with the message "subject: expected ..., got ...".
 pub fn invalid(
     py: Python<'_>,
     subject: impl Display,
@@ -27,12 +26,10 @@ pub fn invalid(
     error(py, "invalid", words)
 }
 
-/// Creates an `EmberwatchError` with a code.
 pub fn failed(py: Python<'_>, problem: &str, code: &str) -> PyErr {
     error(py, "EmberwatchError", (problem, code))
 }
 
-/// Creates an `InvalidArgumentError` with this message.
 pub fn refused(py: Python<'_>, problem: impl Display) -> PyErr {
     error(py, "InvalidArgumentError", (problem.to_string(),))
 }

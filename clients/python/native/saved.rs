@@ -17,20 +17,17 @@ const FORM: Configuration<
 #[derive(Encode, BorrowDecode)]
 pub struct Saved<'a> {
     pub kind: &'a str,
-    /// Text of the model file, if the model is known.
     pub model: Option<&'a str>,
     /// Number of states, height and width.
     pub dim: (usize, usize, usize),
     pub is_single: bool,
     /// The first belief, as `f32`. Empty if there is a checkpoint.
     pub prior: &'a [u8],
-    /// Empty if there is none.
     pub checkpoint: &'a [u8],
     /// Of each world, the number of predictions since the first belief, and the estimator's state.
     pub worlds: Vec<(u64, &'a [u8])>,
 }
 
-/// Returns whether a file contains a saved belief.
 pub fn is_saved(bytes: &[u8]) -> bool {
     bytes.starts_with(MAGIC)
 }

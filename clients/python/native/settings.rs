@@ -17,15 +17,12 @@ use std::ops::Range;
 /// Settings of worlds in this process, with the files that they name, which are read only here.
 #[pyclass(frozen, module = "emberwatch._native")]
 pub struct CheckedSettings {
-    /// The given settings as JSON.
     given: String,
     checked: Checked,
 }
 
-/// Name, moves, robots, steps, first and end of the test seeds, and prefix and version of the environments' ids.
 type TaskFields<'a> = (&'a str, usize, u32, u64, u64, u64, &'a str, u32);
 
-/// A call that makes a copy: the function and its arguments.
 type Copying<'a, 'py> = (Bound<'py, PyAny>, (&'a str, u32, String));
 
 #[pymethods]
@@ -40,7 +37,6 @@ impl CheckedSettings {
         Ok(it)
     }
 
-    /// Returns the same settings with another number of worlds.
     fn with_worlds(&self, py: Python<'_>, worlds: u32) -> PyResult<Self> {
         let checked = self.checked.clone().with_worlds(worlds);
         Ok(Self {
@@ -49,13 +45,11 @@ impl CheckedSettings {
         })
     }
 
-    /// The `ServerInfo` of a server with these settings.
     #[getter]
     fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         records::server_info(py, &self.checked.info())
     }
 
-    /// `None` if the settings have no task.
     #[getter]
     fn task(&self) -> Option<TaskFields<'_>> {
         let task = self.checked.task.as_ref()?;
@@ -85,9 +79,6 @@ impl CheckedSettings {
 
 impl CheckedSettings {
     /// Starts the worlds in this process. `seed` is the first world's; `None`: the seed in the settings.
-    ///
-    /// # Errors
-    /// If a setting applies only to a server, or there is too little memory.
     pub fn embed(&self, py: Python<'_>, seed: Option<u64>) -> PyResult<Embedded> {
         let mut checked = self.checked.clone();
         checked.config.seed = seed.unwrap_or(checked.config.seed);
@@ -149,11 +140,7 @@ pub fn model_text(py: Python<'_>, name: String) -> PyResult<String> {
     model
         .check_on(shape)
         .map_err(|problem| refused(py, problem))?;
-    Ok(text_of(&model))
-}
-
-fn text_of(model: &Model) -> String {
-    toml::to_string(model.file()).expect("invariant: a model was read from TOML")
+    Ok(toml::to_string(model.file()).expect("invariant: a model was read from TOML"))
 }
 
 fn unread(py: Python<'_>, problem: ReadError) -> PyErr {

@@ -26,12 +26,10 @@ pub fn signals() -> impl FnMut() -> bool {
 /// A thread pool that belongs to one object. A global pool would be unusable after a fork, which copies no threads.
 #[derive(Default)]
 pub struct Pool {
-    /// The id of the process that started the threads.
     pid: u32,
     threads: Option<ThreadPool>,
 }
 
-/// How many threads share the work.
 #[derive(Clone, Copy)]
 pub enum Threads {
     One,
@@ -126,7 +124,6 @@ impl Drop for Pool {
 }
 
 impl Threads {
-    /// Applies `work` to each task. Returns the results in the order of the tasks.
     pub fn each<T: Send, U: Send>(
         self,
         tasks: impl IntoIterator<Item = T>,

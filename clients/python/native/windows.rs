@@ -28,7 +28,6 @@ impl Windows {
         windows
     }
 
-    /// Returns the size of the maps.
     pub fn n_bytes(n_rows: usize, shape: Shape, side: usize, n_of_world: usize) -> usize {
         let (height, width) = shape.dim();
         let n_cells = (height + side - 1).saturating_mul(width + side - 1);
@@ -37,7 +36,6 @@ impl Windows {
             .saturating_mul(n_of_world + N_OF_PATH)
     }
 
-    /// Returns the side of a window, and the number of its channels about the world.
     pub fn dim(&self) -> (usize, usize) {
         (self.side, self.n_channels - N_OF_PATH)
     }
@@ -90,7 +88,6 @@ impl Windows {
         }
     }
 
-    /// Returns a grid cell's index in the maps.
     fn index(&self, row: usize, cell: Cell) -> usize {
         let margin = self.side / 2;
         self.padded(row, cell.row + margin, cell.col + margin)

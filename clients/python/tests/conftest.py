@@ -8,12 +8,7 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
-from hypothesis import settings
 from processes import at_the_end
-
-# Hypothesis must not fail examples that are slow on a busy machine; `DEADLINE` limits the test.
-settings.register_profile("emberwatch", deadline=None)
-settings.load_profile("emberwatch")
 
 # A shell may start pytest with signals ignored, and children would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import CHANNELS, LONG, Server, asleep, eventually, script, server, services
+from processes import CHANNELS, LONG, asleep, eventually, script, server, services
 
 from emberwatch import errors
 from emberwatch.client.client import connect
@@ -38,32 +38,22 @@ ENDS: dict[str | signal.Signals, int] = {
 }
 
 
-def check_kill(started: Server, call: Callable[[], object]) -> None:
-    """Kills the server while a call waits for it, and checks the call's error."""
+@pytest.mark.parametrize("what", ["step", "status", "handshake"])
+def test_killing_the_server_raises_server_gone(what: str) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    calls: dict[str, Callable[[], object]] = {
+        "step": lambda: lease.step([3] * 6, timeout=LONG),
+        "status": lambda: client.status(timeout=LONG),
+        "handshake": lambda: connect(started.instance, timeout=LONG),
+    }
     started.stop()
-
-    def kill() -> None:
-        asleep()
-        started.kill()
-
-    killer = threading.Thread(target=kill)
+    killer = threading.Thread(target=lambda: (asleep(), started.kill()))
     killer.start()
     with pytest.raises(errors.ServerGoneError, match=started.instance):
-        call()
+        calls[what]()
     killer.join()
-
-
-def test_killing_the_server_raises_server_gone() -> None:
-    for what in ("step", "control", "handshake"):
-        started = server()
-        client = started.connect()
-        lease = client.acquire()
-        calls: dict[str, Callable[[], object]] = {
-            "step": lambda lease=lease: lease.step([3] * 6, timeout=LONG),
-            "control": lambda client=client: client.status(timeout=LONG),
-            "handshake": lambda started=started: connect(started.instance, timeout=LONG),
-        }
-        check_kill(started, calls[what])
 
 
 class Remains:

@@ -33,7 +33,7 @@ from failures import fails, refuses
 from processes import asleep, isolated, script
 
 import emberwatch
-from emberwatch.errors import EmberwatchError, LeaseLostError, ServerGoneError
+from emberwatch.errors import EmberwatchError, ServerGoneError
 from emberwatch.model import Model
 
 
@@ -60,14 +60,9 @@ def threads() -> set[str]:
     return set(os.listdir("/proc/self/task"))
 
 
-def opened() -> tuple[str, set[str], set[str]]:
-    us = os.getpid()
+def opened() -> set[str]:
     files = [path for path in Path("/proc/self/fd").iterdir() if path.is_symlink()]
-    return (
-        Path(f"/proc/self/task/{us}/children").read_text(),
-        {os.readlink(path) for path in files},
-        {name for name in os.listdir("/dev/shm") if f"{us:08x}_" in name},  # as iceoryx2 names them
-    )
+    return {os.readlink(path) for path in files}
 
 
 @pytest.mark.parametrize("kind", MAKERS)
@@ -78,8 +73,6 @@ def test_nothing_is_opened_before_the_first_reset(kind: str) -> None:
     assert threads() <= before[1]
     env.reset(seed=1)
     assert threads() - before[1]
-    children, _, shared = opened()
-    assert (children, shared) == (before[0][0], before[0][2])
 
 
 #: Uses everything that needs no server.
@@ -189,19 +182,14 @@ def test_snapshots_and_forks_equal_a_servers(client: emberwatch.Client, tmp_path
 
 
 def test_errors_have_the_codes_of_a_server(client: emberwatch.Client) -> None:
-    lease, other = client.acquire(0), client.acquire(1)
+    lease = client.acquire(0)
     with fails("no_such_robot"):
         client.acquire(7)
-    with fails("no_such_world"):
-        client.snapshot("worlds", 5, 1)
-    other.release()
-    with pytest.raises(LeaseLostError):
-        other.step([3] * 4)
     with fails("bad_file"):
         lease.restore("nowhere")
     assert client.status().worlds[0].holder_pids == (os.getpid(),)
     client.shutdown()
-    with pytest.raises(ServerGoneError):
+    with pytest.raises(ServerGoneError, match="ended by shutdown"):
         lease.step([3] * 4)
 
 
@@ -212,7 +200,6 @@ def test_wrong_settings_are_refused(client: emberwatch.Client) -> None:
         _ = make().unwrapped.instance
     for settings, words in (
         ({"snapshot_keep": 9}, "^snapshot_keep: expected to be left out"),
-        ({"snapshot_every": 5, "snapshot_dir": "."}, "snapshot_every: expected to be left out"),
         ({"model": "\ud800"}, "model: expected UTF-8"),
         ({"wrolds": 2}, "^wrolds: expected the name of a setting \\(burn_in, .*\\), got 2$"),
         ({"height": 7.0}, "^height: expected an integer, True or False, text or a path, got 7.0$"),
@@ -318,13 +305,3 @@ def test_files_are_read_once(
             again.close()
     with refuses("model|task|states"):
         pickle.loads(pickled)
-
-
-def test_a_model_is_given_as_such_or_as_text() -> None:
-    model = Model.named("wildfire-small")
-    worlds = {**SMALL, "model": "wildfire-small"}
-    expected = rollout(make(**worlds), 8, seed=1)
-    for given in (model, model.toml):
-        env = make(**{**worlds, "model": given})
-        assert env.unwrapped.model == model
-        assert_same(rollout(env, 8, seed=1), expected)

@@ -17,7 +17,6 @@ import pytest
 from processes import eventually, find, server, unused_instance
 
 import emberwatch
-from emberwatch.errors import EmberwatchError
 
 #: Prints an error's type, code and message.
 HEAD = """
@@ -35,8 +34,6 @@ def refuse(number, errno):  # a seccomp filter: this system call fails, all othe
     assert libc.prctl(38, 1, 0, 0, 0) == 0 and libc.prctl(22, 2, program, 0, 0) == 0
 LARGE = {"worlds": 256, "height": 1024, "width": 1024, "burn_in": 0}
 """
-
-LARGE = ["--worlds=64", "--height=1024", "--width=1024", "--burn-in=0"]
 
 #: Numbers of x86-64 system calls.
 CALLS = {"flock": 73, "fallocate": 285, "pidfd_open": 434, "socket": 41, "clone3": 435}
@@ -115,9 +112,6 @@ print(len(lease.reset(range(32))))
         said = python("tell(lambda: emberwatch.embed(**LARGE))", limit=enter)
         assert said.startswith("NotEnoughMemoryError no_memory memory: expected "), said
         assert f"the limit of a cgroup ({outer}/memory." in said, said
-        place = f"--instance={unused_instance()}"
-        ended = run(find("emberwatch-server"), place, *LARGE, limit=enter)
-        assert ended.returncode == 1 and f"cgroup ({outer}/memory." in ended.stderr, ended
         assert python(few, limit=enter) == "32\n"
 
 
@@ -140,9 +134,8 @@ for kind, side, n_worlds in ("known", 4, 1 << 20), ("known+cavities", 16, 40_000
 
 
 def test_memory_errors_are_also_python_memory_errors() -> None:
-    with pytest.raises(MemoryError, match="for 1024 worlds of 4096 x 4096 cells") as caught:
+    with pytest.raises(MemoryError, match="for 1024 worlds of 4096 x 4096 cells"):
         emberwatch.embed(worlds=1024, height=4096, width=4096)
-    assert isinstance(caught.value, EmberwatchError)
 
 
 @as_root
@@ -185,7 +178,6 @@ tell(lambda: emberwatch.connect(sys.argv[1], wait=100))
 """
     starts = "refuse(int(sys.argv[1]), int(sys.argv[2])); os.execv(sys.argv[3], sys.argv[3:])"
     program = [sys.executable, "-c", HEAD + starts]
-    of_server = [["status", f"--instance={running.instance}"], [f"--instance={unused_instance()}"]]
     for call, number in (
         ("pidfd_open", errno.EPERM),
         ("flock", errno.EPERM),
@@ -197,10 +189,9 @@ tell(lambda: emberwatch.connect(sys.argv[1], wait=100))
         told = python(code, running.instance, CALLS[call], number).splitlines()
         assert told[0].startswith("made ") and "--security-opt seccomp" in told[1], told
         assert told[1].startswith(f"EmberwatchError channel {words}"), told
-        for more in of_server:
-            flags = [str(CALLS[call]), str(number), find("emberwatch-server"), *more]
-            ended = run(*program, *flags)
-            assert ended.returncode == 1 and words in ended.stderr, ended
+        server_flags = [find("emberwatch-server"), f"--instance={unused_instance()}"]
+        ended = run(*program, str(CALLS[call]), str(number), *server_flags)
+        assert ended.returncode == 1 and words in ended.stderr, ended
 
 
 @on_x86

@@ -1,6 +1,5 @@
 """Arguments of the Rust module: refusals instead of panics, Ctrl-C, and concurrent threads."""
 
-import os
 import signal
 import threading
 from collections.abc import Callable
@@ -9,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from failures import fails, refuses
-from processes import LONG, asleep, eventually, script, server
+from processes import LONG, asleep, ctrl_c, eventually, script, server
 
 from emberwatch import _native, errors
 from emberwatch.belief import known, uniform_prior
@@ -43,18 +42,9 @@ def test_ctrl_c_ends_a_close_that_waits_for_another_thread() -> None:
     steps = threading.Thread(target=lambda: lease.step([3] * 6, timeout=LONG))
     steps.start()
     asleep(steps)
-
-    def interrupt() -> None:
-        asleep()
-        os.kill(os.getpid(), signal.SIGINT)
-        asleep()
-        started.wake_up()  # Ends `close` if the interrupt did not.
-
-    thread = threading.Thread(target=interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        thread.start()
+    with ctrl_c():
         client.close()
-    thread.join()
+    started.wake_up()
     steps.join()
     assert client.status().pid == started.program.pid
     client.close()
@@ -99,20 +89,15 @@ def meets(work: Callable[[], object], kind: type[Exception], words: str) -> None
     thread.join()
 
 
-def test_flights_refuse_wrong_rows_and_states() -> None:
-    def flights(n_moves: int = 4) -> _native.Flights:
-        return _native.Flights(2, 3, 5, n_moves, [1.0])
-
+def test_flights_refuse_wrong_grids_and_states() -> None:
     for n_moves in (0, 4097):
         with refuses(f"n_moves: expected an integer within 1 to 4096, got {n_moves}"):
-            flights(n_moves)
+            _native.Flights(2, 3, 5, n_moves, [1.0])
     with refuses("grid: expected height and width"):
         _native.Flights(2, 0, 5, 4, None)
-    with refuses("row: expected a row below 2, got 2"):
-        flights().made(2)
-    with pytest.raises(ValueError, match="paths: expected one action per row"):
-        flights().paths(np.zeros(1, np.uint8))
-    begun, robots = np.ones(2, np.bool_), np.zeros((2, 2), np.int64)
-    for shape in ((1, 3, 5), (2, 3, 4)):
-        with refuses(r"states: expected shape \(2, 3, 5\), got"):
-            flights().start_paths(begun, robots, np.zeros(shape, np.uint8))
+    flights, begun = _native.Flights(2, 3, 5, 4, [1.0]), np.ones(2, np.bool_)
+    with refuses(r"states: expected shape \(2, 3, 5\), got"):
+        flights.start_paths(begun, np.zeros((2, 2), np.int64), np.zeros((2, 3, 4), np.uint8))
+    for robot in ((3, 0), (0, 5), (-1, 0)):
+        with pytest.raises(ValueError, match="robots on the grid"):
+            flights.start_paths(begun, np.array([(0, 0), robot]), None)

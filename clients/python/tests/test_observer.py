@@ -33,24 +33,17 @@ def test_a_published_frame_equals_the_steps_answer() -> None:
     started = server(worlds=2)
     lease = started.connect().acquire(1)
     with observe(started.instance) as observer:
-        frames = frames_until(observer, 0, world=1, seed=0)
-        start, kept = (0, 0), list[tuple[np.ndarray, np.ndarray]]()
-        for k in range(1, 21):
+        frames, start = frames_until(observer, 0, world=1), (0, 0)
+        for k in range(1, 5):
             answer = lease.step(paths(k))
-            new = frames_until(observer, k, world=1)
-            frame = new[-1]
-            (robot,) = frame.robots
-            assert (frame.result, robot.result) == answer.result()
-            assert (robot.frame == answer.frames[0]).all() and robot.frame.dtype == np.uint8
-            assert (frame.frame == robot.frame).all()
+            frames += frames_until(observer, k, world=1)
+            (robot,) = frames[-1].robots
+            assert (frames[-1].result, robot.result) == answer.result()
+            assert robot.frame.tobytes() == frames[-1].frame.tobytes() == answer.frames.tobytes()
             assert (robot.path == paths(k)[0]).all()
             assert robot.result.start == start
             start = robot.result.cell
-            frames += new
-            kept.append((robot.frame, robot.frame.copy()))
-    for one, copied in kept:
-        assert (one == copied).all()
-        one[:] = 0  # the reader may write to it
+            robot.frame[:] = 0  # the reader may write to it
     assert sum(frame.n_lost for frame in frames) == 0
 
 
@@ -93,39 +86,29 @@ def test_a_closed_reader_refuses_and_may_be_closed_again() -> None:
 def test_an_agents_beliefs_can_be_read() -> None:
     started = server(height=16, width=24, moves=12, burn_in=500)
     command = [find("emberwatch-agent"), "run", "--instance", started.instance]
-    with OutlookReader(started.instance) as reader:
-        agent = subprocess.Popen(command)
-        try:
-            last = 0
-            while last < 30:
-                outlook = reader.receive(PATIENCE)
-                assert outlook is not None and outlook.step >= last
-                np.testing.assert_allclose(outlook.belief.sum(axis=0), np.ones((16, 24)), atol=1e-4)
-                assert outlook.states == ("normal", "latent", "fire")
-                assert outlook.policy == "beam"
-                last = outlook.step
-            assert (outlook.objective, outlook.pid) == ("fire", agent.pid)
-            agent.terminate()
-            assert agent.wait(PATIENCE) == 0
-        finally:
-            agent.kill()
+    with OutlookReader(started.instance) as reader, subprocess.Popen(command) as agent:
+        for _ in range(9):
+            outlook = reader.receive(PATIENCE)
+            assert outlook is not None
+            np.testing.assert_allclose(outlook.belief.sum(axis=0), np.ones((16, 24)), atol=1e-4)
+        agent.terminate()
+    assert outlook.step > 0 and outlook.states == ("normal", "latent", "fire")
+    assert (outlook.policy, outlook.objective, outlook.pid) == ("beam", "fire", agent.pid)
+    assert (outlook.world, outlook.robots) == (0, range(1))
 
 
 def test_too_many_or_invalid_readers_are_refused() -> None:
     kinds = observe, TruthReader, OutlookReader
     names = "MAX_OBSERVERS", "MAX_TRUTH_READERS", "MAX_AGENT_READERS"
     started = server(publish_truth=True)
-    lease = started.connect().acquire()
     for make, limit in zip(kinds, map(LIMITS.__getitem__, names), strict=True):
         readers = [make(started.instance) for _ in range(limit)]
         with fails("channel", match=f"at most {limit} (readers|observers)"):
             make(started.instance)
-        lease.step(paths(0))
         for reader in readers:
             assert make is OutlookReader or reader.receive(PATIENCE) is not None
             reader.close()
-        make(started.instance).close()
-    for timeout in (-1, -0.001, float("nan")):
+    for timeout in (-0.001, float("nan")):
         with refuses("timeout: expected seconds"):
             observe(timeout=timeout)
     with refuses("instance"):

@@ -78,7 +78,7 @@ def test_a_second_copy_of_the_library_is_refused_while_the_first_is_connected(
     copy = another_copy(tmp_path)
     with started.connect() as client:
         lease = client.acquire()
-        for opens in (copy.connect, copy.observe, copy.TruthReader):
+        for opens in (copy.Client, copy.Observer):
             with fails("channel", match="one copy of Emberwatch's library in this process"):
                 opens(started.instance)
             lease.step([3] * 6)

@@ -36,19 +36,6 @@ def states(tmp_path: Path, sequences: list[States]) -> Path:
     return path
 
 
-def test_autoreset_follows_the_end_of_a_sequence(states: Path) -> None:
-    envs: Any = gymnasium.make_vec(WILDFIRE, num_envs=2, states=states, n_moves=3)
-    envs.reset(seed=0)
-    ends: list[NDArray[np.bool_]] = []
-    for _ in range(20):
-        _, _, terminations, truncations, _ = envs.step(envs.action_space.sample())
-        assert not terminations.any()
-        ends.append(truncations)
-    # The first episodes have seeds 0 and 1. An automatic reset takes a step of its own.
-    assert [int(np.argmax(of_world)) for of_world in np.transpose(ends)] == [3, 5]
-    assert np.sum(ends, axis=0).min() >= 2
-
-
 def test_a_running_server_describes_its_recorded_world(states: Path) -> None:
     with serving(states=states, **OF_STATES) as instance:
         with emberwatch.connect(instance) as client:

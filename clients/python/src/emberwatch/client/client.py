@@ -5,9 +5,11 @@ from typing import Final
 
 from emberwatch._native import Client as Client
 from emberwatch._native import Lease as Lease
-from emberwatch._native import connect as connect
 from emberwatch.common.arguments import read_settings
 from emberwatch.model import Model
+
+#: Connects to a running server.
+connect: Final = Client
 
 #: Default timeout of a step, seconds.
 STEP_TIMEOUT: Final = 5.0

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from emberwatch._native import Observer as Observer
 from emberwatch._native import OutlookReader as OutlookReader
 from emberwatch._native import TruthReader as TruthReader
-from emberwatch._native import observe as observe
 from emberwatch.client.wire import RobotResult, WorldResult
 from emberwatch.errors import EmberwatchError, RequestTimeoutError
+
+#: Observes the frames of an instance.
+observe: Final = Observer
 
 #: Seconds to wait for the samples of given steps before a new reader is opened.
 _RETRY: Final = 0.02

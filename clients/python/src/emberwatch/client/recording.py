@@ -77,10 +77,8 @@ _WARNINGS = {"cut": RecordingCutWarning, "damaged": RecordingDamagedWarning}
 
 
 def _records(path: str | os.PathLike[str]) -> Iterator[Record]:
-    file = _native.Recording(os.fspath(path))
     server = None
-    while (record := file.read()) is not None:
-        nanos, content = record
+    for nanos, content in _native.Recording(os.fspath(path)):
         if isinstance(content, ServerInfo):
             server = content
         elif server is not None:  # a recording names the server before its samples

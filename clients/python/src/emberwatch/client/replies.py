@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from emberwatch.client.wire import Shape
 from emberwatch.model import Description
 from emberwatch.model.airspace import Airspace
 
@@ -76,11 +75,6 @@ class ServerInfo:
         """The description of recorded states; None if there are none, or the server hides it."""
         text = None if self.recorded_world is None else self.recorded_world.description
         return None if text is None else Description.from_toml(text)
-
-    @property
-    def shape(self) -> Shape:
-        """The sizes that determine the layout of this server's answers."""
-        return Shape(self.n_robots, self.height, self.width)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

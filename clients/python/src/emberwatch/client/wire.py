@@ -95,17 +95,3 @@ ROBOT: Final = struct.Struct("=ddIIIIIIII")
 WORLD_DTYPE: Final = np.dtype([*zip(WorldResult._fields, WORLD.format[1:], strict=True)])
 ROBOT_DTYPE: Final = np.dtype([*zip(RobotResult._fields, ROBOT.format[1:], strict=True)])
 RESULT_DTYPE: Final = np.dtype([("world", WORLD_DTYPE), ("robot", ROBOT_DTYPE)])
-
-
-class Shape(NamedTuple):
-    """The sizes that determine the layout of answers, from the reply to `hello`."""
-
-    #: Number of robots in a world, R.
-    n_robots: int
-    height: int
-    width: int
-
-    def n_worlds(self, first_robot: int, n_robots: int) -> int:
-        """Returns the number of worlds that the given consecutive robots are in."""
-        last_robot = first_robot + n_robots - 1
-        return last_robot // self.n_robots - first_robot // self.n_robots + 1

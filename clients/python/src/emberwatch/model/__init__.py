@@ -58,7 +58,8 @@ class Description:
         text = text.removeprefix(BYTE_ORDER_MARK)
         try:
             values = cls._read(text)
-            values["airspace"] = Airspace(**values["airspace"])
+            for colors in ("state_colors", "observation_colors"):
+                values[colors] = tuple(map(color_from_hex, values[colors]))
             return cls(**values, toml=text)
         except (TypeError, ValueError) as error:
             expected = "a file that `emberwatch-server --check` accepts"
@@ -69,17 +70,7 @@ class Description:
         radius = as_count(radius, "radius", 0, _native.MAX_RADIUS)
         if radius == self.airspace.radius:
             return self
-        return self.from_toml(self._with_radius(self.toml, radius))
-
-    @property
-    def sensor_radius(self) -> int:
-        """Number of rows and columns that robots see beyond each cell of their path."""
-        return self.airspace.radius
-
-    @property
-    def no_fly(self) -> NDArray[np.bool_] | None:
-        """True in the no-fly cells, shape (H, W); None if there are none."""
-        return self.airspace.no_fly
+        return self.from_toml(_native.with_radius(self.toml, radius))
 
     @property
     def n_states(self) -> int:
@@ -108,10 +99,6 @@ class Description:
     def _read(text: str) -> dict[str, Any]:
         """Returns the values of all fields except `toml`."""
         return _native.read_description(text)
-
-    @staticmethod
-    def _with_radius(text: str, radius: int) -> str:
-        return _native.description_with_radius(text, radius)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,10 +199,6 @@ class Model(Description):
         for factors in values["maps"].values():
             factors.flags.writeable = False
         return values
-
-    @staticmethod
-    def _with_radius(text: str, radius: int) -> str:
-        return _native.model_with_radius(text, radius)
 
 
 @functools.lru_cache(maxsize=8)
