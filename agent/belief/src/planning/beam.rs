@@ -386,4 +386,11 @@ mod tests {
             assert_eq!(search.beam.len(), expected.len(), "{shape}");
         }
     }
+
+    #[test]
+    fn ordered_bits_keep_the_order_of_scores() {
+        let infinity = f32::INFINITY;
+        let numbers = [-infinity, -2.0, -1e-30, 0.0, 1e-30, 1.0, 3.0, infinity];
+        assert!(numbers.map(ordered_bits).is_sorted());
+    }
 }
