@@ -9,6 +9,7 @@ use emberwatch_protocol::message::{Status, StepRequest};
 use emberwatch_protocol::observer::Observer;
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use std::time::Duration;
+use tests::fuzz::TARGETS;
 use tests::harness::{Paths, Server, eventually, send_paths};
 use tests::siege::{FLAGS, besiege};
 use tests::wire::{RawClient, Wire, client, control_header, step_body, step_header};
@@ -244,6 +245,15 @@ fn messages_of_any_length_get_short_replies() {
             assert_eq!(reply.status, *expected as u32, "{begin:?}");
             assert!(got <= 16 << 10, "{got} bytes in answer to {begin:?}");
             let refused = wire.status_of(second_robot(lease), text.as_bytes());
+            assert_eq!(refused, (Status::WrongLength, 8 + 6));
+        }
+        let files = TARGETS
+            .iter()
+            .flat_map(|target| target.corpus().expect("its corpus"));
+        let ends_server = |file: &[u8]| file.ends_with(br#"{"op":"shutdown"}"#);
+        for file in files.filter(|file| !ends_server(file)) {
+            wire.control(control_header(1), &file);
+            let refused = wire.status_of(second_robot(lease), &file);
             assert_eq!(refused, (Status::WrongLength, 8 + 6));
         }
     });
