@@ -1,6 +1,5 @@
 //! Tests of the beliefs that agents publish on their channel.
 
-use crate::trainings::on;
 use emberwatch_protocol::agent_belief::AgentBelief;
 use emberwatch_protocol::message::AgentHeader;
 use emberwatch_protocol::observer::Observer;
@@ -89,7 +88,7 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
         let words = format!(
             "compare --policies known/beam/exploit --baseline known/beam/exploit --seeds 0..8 --steps {n_steps} \
              {}",
-            on(&server)
+            server.flag()
         );
         Program::start(AGENT, &words)
     };
@@ -113,7 +112,7 @@ fn a_training_shows_what_it_believes_of_all_its_worlds() {
         "--config {config} --out {} --world 1 --worlds 2",
         folder.word("out")
     );
-    let _training = Program::start(AGENT, &format!("train {} {flags}", on(&server)));
+    let _training = Program::start(AGENT, &format!("train {} {flags}", server.flag()));
     let shown = until_all(&observer, 1..3);
     assert!(shown.iter().all(|shown| shown.header.world > 0));
     for AgentBelief { belief, intent, .. } in &shown {

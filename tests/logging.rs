@@ -155,7 +155,7 @@ fn dropped_lines_are_counted_and_reported() {
 #[test]
 fn readers_that_leave_end_programs_silently() {
     let server = Server::start(SMALL);
-    let instance = format!("--instance {}", server.instance.name());
+    let instance = server.flag();
     for (program, arguments) in [
         (SERVER, "--help"),
         (SERVER, "--check"),

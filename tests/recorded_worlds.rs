@@ -1,7 +1,6 @@
 //! Tests of recorded worlds: servers show and restore them, and agents act there without a known model.
 
 use crate::commands::{agent, check, check_table};
-use crate::trainings::on;
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::client::truth::TruthFeed;
 use emberwatch_protocol::Shape;
@@ -143,7 +142,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     let results = Folder::default();
     let settings = results.write("agent.toml", small);
     let server = Server::start(&place.flags("--worlds 5 --coverage client"));
-    let act = |words: &str| agent(&format!("{words} {}", on(&server)));
+    let act = |words: &str| agent(&format!("{words} {}", server.flag()));
     let out = results.word("out");
     act(&format!(
         "train --worlds 2 --steps 400 --out {out} --config {settings}"
@@ -177,7 +176,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
             "--steps: expected at most 23, the length of the shortest episode, got 24",
         ),
     ] {
-        check(AGENT, &format!("{words} {}", on(&server)), expected);
+        check(AGENT, &format!("{words} {}", server.flag()), expected);
     }
 }
 

@@ -2,7 +2,6 @@
 //! affects only its own robots.
 
 use crate::commands::check;
-use crate::trainings::on;
 use emberwatch_protocol::Client;
 use emberwatch_protocol::connection::ConnectionError;
 use emberwatch_protocol::message::{Status, StepRequest, WorldResult};
@@ -212,7 +211,8 @@ fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
         "shared frames change the beliefs, and so the paths"
     );
     let server = Server::start(&format!("{FLAGS} --publish-truth"));
-    let check = |flags: &str, words: &str| check(AGENT, &format!("{flags} {}", on(&server)), words);
+    let check =
+        |flags: &str, words: &str| check(AGENT, &format!("{flags} {}", server.flag()), words);
     let robots = "expected a part of the world's robots 0..4, got";
     check("run --robots 4", &format!("{robots} 4..5"));
     check("run --robots 2..6 --team joint", &format!("{robots} 2..6"));

@@ -110,6 +110,11 @@ impl Server {
         Client::acquire(self.connect(), &takeover(robots)).expect("take over")
     }
 
+    /// Returns the flag that names this instance.
+    pub fn flag(&self) -> String {
+        format!("--instance {}", self.instance.name())
+    }
+
     pub fn info(&self) -> ServerInfo {
         self.connect().info().clone()
     }
@@ -138,10 +143,7 @@ impl Server {
 
     /// Runs a subcommand of the server program on this instance.
     pub fn command(&self, words: &str) -> Ended {
-        run(
-            SERVER,
-            &format!("{words} --instance {}", self.instance.name()),
-        )
+        run(SERVER, &format!("{words} {}", self.flag()))
     }
 
     /// Kills the server with SIGKILL and waits until it has ended.
@@ -172,19 +174,6 @@ pub fn new_instance() -> Instance {
     let count = COUNTER.fetch_add(1, Ordering::Relaxed);
     let name = format!("test-{}-{count}", std::process::id());
     Instance::new(&name).expect("a plain name")
-}
-
-/// Returns the description of a server with one world of 2 x 3 cells, to be stored in a recording.
-pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
-    let text = r#"{"protocol":3,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":0,"n_worlds":1,"n_robots":0,
-        "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
-        "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
-    let info = serde_json::from_str(text).expect("what a server says");
-    ServerInfo {
-        n_moves,
-        n_robots,
-        ..info
-    }
 }
 
 /// Returns the files of an instance's services.
