@@ -26,7 +26,11 @@ const WRONG_SERVER_FLAGS: &str = r#"
 --bogus => --bogus
 status --instance nobody => no server on instance "nobody"
 stop --instance nobody => no server on instance "nobody"
-stop --json => --json
+record => --out
+record --out / => --out / | --force
+record --out /no/such => --out /no/such: No such file
+record --out /dev/null => --out | expected a new file | --force
+record --worlds x --out o => --worlds | 'x'
 "#;
 
 /// Invalid flags of the agent, and words of the resulting error.

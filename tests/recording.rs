@@ -1,6 +1,5 @@
 //! Tests of recorders: what they record, and how recorders and recordings report missing samples.
 
-use crate::commands::check_table;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::message::{FrameHeader, TruthHeader};
 use emberwatch_protocol::observer::{Observer, Sample};
@@ -12,19 +11,18 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tests::harness::{
-    Ended, Folder, Paths, Program, SERVER, SMALL, Server, fly_on, frames_until, new_instance,
-    send_paths,
+    Ended, Paths, Program, SERVER, SMALL, Server, fly_on, frames_until, new_instance, send_paths,
 };
 
 /// Creates a temporary folder. Returns the folder, and the path of a file in it that does not exist yet.
-pub fn new_file() -> (TempDir, PathBuf) {
+fn new_file() -> (TempDir, PathBuf) {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("test.recording");
     (folder, file)
 }
 
 /// Starts a recorder and waits until it observes.
-pub fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
+fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
     let (name, file) = (instance.name(), file.display());
     let recorder = Program::start(
         SERVER,
@@ -34,7 +32,7 @@ pub fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program 
     recorder
 }
 
-pub fn stop(recorder: Program) -> Ended {
+fn stop(recorder: Program) -> Ended {
     let ended = recorder.finish();
     ended.check_says("recorded");
     ended
@@ -54,13 +52,13 @@ fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
     (whole.collect(), error)
 }
 
-pub fn read_whole(file: &Path) -> Vec<Record> {
+fn read_whole(file: &Path) -> Vec<Record> {
     let (records, error) = read(file);
     assert!(error.is_none(), "{error:?}");
     records
 }
 
-pub fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
+fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
     let frame = |record: &Record| match &record.event {
         Event::Frame(sample) => Some(sample.clone()),
         _ => None,
@@ -251,19 +249,4 @@ fn nobody_else_reads_a_recording() {
     let mut seen = String::new();
     old.read_to_string(&mut seen).expect("read");
     assert_eq!(seen, "open to everybody");
-}
-
-#[test]
-fn wrong_input_is_named() {
-    let folder = Folder::default();
-    let table = r#"
-record => --out
-record --out / => --out / | --force
-record --out /no/such => --out /no/such: No such file
-record --out GOOD => --out | expected a new file | --force
-record --worlds x --out o => --worlds | 'x'
-"#
-    .replace("GOOD", &folder.write("good", "left as it is"));
-    check_table(SERVER, &table);
-    assert_eq!(folder.text("good"), "left as it is");
 }
