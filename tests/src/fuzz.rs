@@ -6,7 +6,6 @@
 mod files;
 mod messages;
 mod requests;
-mod worlds;
 
 use std::path::{Path, PathBuf};
 
@@ -20,7 +19,7 @@ pub struct Target {
 }
 
 /// All targets.
-pub const TARGETS: [Target; 11] = [
+pub const TARGETS: [Target; 8] = [
     target("step_request", requests::step),
     target("control_request", requests::control),
     target("step_answer", messages::step_answer),
@@ -29,9 +28,6 @@ pub const TARGETS: [Target; 11] = [
     target("control_reply", messages::control_reply),
     target("model", files::model),
     target("checkpoint", files::checkpoint),
-    target("states", worlds::states),
-    target("snapshot", worlds::snapshot),
-    target("recording", worlds::recording),
 ];
 
 const fn target(name: &'static str, body: fn(&[u8]) -> bool) -> Target {
