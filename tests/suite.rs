@@ -1,6 +1,6 @@
 //! Tests of `emberwatch-agent suite` and `leaderboard`: results, the score, and the page of entries.
 
-use crate::commands::{agent, check, check_table};
+use crate::commands::{agent, check};
 use emberwatch_agent::benchmark::report::PolicyRun;
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use rustix::process::Signal;
@@ -180,22 +180,4 @@ fn a_suite_trains_what_its_policies_lack_and_leaves_gaps() {
     let anew = suite("--train --train-steps 64");
     anew.check_says("training filter for learned_beam");
     assert!(checkpoint("tiny").exists());
-}
-
-#[test]
-fn wrong_suites_and_entries_are_named_before_anything_runs() {
-    let place = Place::new();
-    let table = "suite --tasks ash => task ash: No such file | expected a file, or one of wildfire, small
-suite --tasks TINY,jacksboro --out OUT --policies coverage,known/beam/xyz => tiny.toml: policy \"known/beam/xyz\": goal: expected one of | got \"xyz\"
-suite --policies bem => policy: expected one of | got \"bem\"
-suite --worlds 0 => --worlds
-suite --tasks small --checkpoints no/such => --checkpoints: expected a folder, got no/such
-suite --train => --checkpoints
-suite --checkpoints runs --train-steps 5 => --train
-leaderboard --entries no/such => expected a folder of entries at no/such
-leaderboard --policy mine => --add
-leaderboard --add x --policy mine => --by";
-    let table = table.replace("TINY", &place.0.word("tiny.toml"));
-    check_table(AGENT, &table.replace("OUT", &place.0.word("out")));
-    assert!(!place.0.path("out").exists(), "nothing ran");
 }

@@ -10,11 +10,7 @@ use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::path::path_from_bytes;
 use emberwatch_protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
-use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_protocol::{Client, Connection, Move};
-use emberwatch_sim::config::ServerConfig;
-use emberwatch_sim::snapshot::{SnapshotWorld, WorldSpec, encode};
-use emberwatch_sim::world::Episode;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -22,7 +18,6 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
-use tempfile::TempDir;
 
 pub use crate::programs::{
     AGENT, Ended, Folder, LIMIT, PATIENCE, Program, SERVER, eventually, program_path, python,
@@ -74,26 +69,6 @@ impl Server {
             program: Program::start(SERVER, &arguments),
             instance: instance.clone(),
         }
-    }
-
-    /// Starts a server with two worlds of the size of [`SMALL`] at k = 0. If these worlds are reset, the burn-in never
-    /// ends.
-    pub fn start_with_endless_resets(flags: &str) -> Self {
-        let WorldSpec {
-            settings,
-            mut rules,
-        } = small_spec(ENDLESS);
-        rules.burn_in = 0;
-        let episodes = [0, 1].map(|seed| Episode::new(&rules, seed));
-        let worlds = episodes.each_ref().map(SnapshotWorld::Ready);
-        let folder = TempDir::new().expect("a folder for the worlds");
-        let file = folder.path().join("worlds.snapshot");
-        std::fs::write(&file, encode(&settings, &worlds).expect("small")).expect("write");
-        let shape = "--height 5 --width 7 --moves 6 --worlds 2";
-        let file = file.display();
-        Self::start(&format!(
-            "{shape} --burn-in {ENDLESS} --restore {file} {flags}"
-        ))
     }
 
     pub fn connect(&self) -> Connection {
@@ -183,22 +158,6 @@ pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
     let name = format!("emberwatch/v3/{}/", instance.name());
     let text = |path: &PathBuf| std::fs::read_to_string(path).unwrap_or_default();
     files.filter(|path| text(path).contains(&name)).collect()
-}
-
-/// Returns the settings and rules of the worlds of a [`SMALL`] server.
-pub fn small_spec(burn_in: u64) -> WorldSpec {
-    let config = ServerConfig {
-        world: WorldSettings {
-            height: 5,
-            width: 7,
-            moves: 6,
-            burn_in,
-            ..WorldSettings::default()
-        },
-        ..ServerConfig::default()
-    };
-    let checked = config.check().expect("valid settings");
-    WorldSpec::of(&checked).expect("a valid model")
 }
 
 /// Asks for the server's status over a new connection.
