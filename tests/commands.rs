@@ -59,6 +59,7 @@ train --out /proc/no => create /proc/no
 train --out OUT --worlds 0 => --worlds | 1..=1024
 train --out OUT --instance nobody => no server on instance "nobody"
 train --out OUT --instance x --height 9 => --instance | --height
+train --out OUT --learner filtre => --learner | filter | 'filtre'
 train --out OUT --world 3 => --instance
 train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: No such file
 compare --instance x --height 9 => --instance | --height
@@ -181,27 +182,21 @@ fn worlds_in_which_nothing_pays_or_burns_are_warned_of_once() {
 fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
     for (settings, table) in [
         (
-            "--reveal-model false",
-            "run SERVER --world 1 => no such world | worlds 0 to 0
-run SERVER => does not reveal its model | --model FILE",
-        ),
-        (
             "--reveal-model false --publish-truth",
-            "compare SERVER --policies coverage => instance | comparing needs the model | --reveal-model true",
-        ),
-        (
-            "--publish-truth",
-            "run SERVER --robots 0..2 => robots: expected a part of the world's robots 0..1, got 0..2
-run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\"",
+            "run SERVER => does not reveal its model | --model FILE
+compare SERVER --policies coverage => instance | comparing needs the model | --reveal-model true",
         ),
         (
             "",
-            "compare SERVER --policies coverage,oracle_beam => oracle_beam | --publish-truth",
+            "run SERVER --world 1 => no such world | worlds 0 to 0
+run SERVER --robots 0..2 => robots: expected a part of the world's robots 0..1, got 0..2
+run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\"
+compare SERVER --policies coverage,oracle_beam => oracle_beam | --publish-truth
+train SERVER --out x --worlds 1 --world 4294967294 => no such world: there are worlds 0 to 0",
         ),
     ] {
         let server = Server::start(&format!("{SMALL} {settings}"));
-        let flag = server.flag();
-        check_table(AGENT, &table.replace("SERVER", &flag));
+        check_table(AGENT, &table.replace("SERVER", &server.flag()));
     }
 }
 

@@ -40,16 +40,12 @@ fn stop(recorder: Program) -> Ended {
 
 /// Returns the intact records at the start of a file, and the error that follows them, if any.
 fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
-    let mut reader = Reader::new(File::open(file).expect("the file")).expect("a recording");
-    let mut error = None;
-    let whole = reader.by_ref().map_while(|record| match record {
-        Ok(record) => Some(record),
-        Err(problem) => {
-            error = Some(problem);
-            None
-        }
-    });
-    (whole.collect(), error)
+    let reader = Reader::new(File::open(file).expect("the file")).expect("a recording");
+    let (mut records, mut errors) = (Vec::new(), Vec::new());
+    for record in reader {
+        record.map_or_else(|error| errors.push(error), |record| records.push(record));
+    }
+    (records, errors.pop())
 }
 
 fn read_whole(file: &Path) -> Vec<Record> {

@@ -114,7 +114,7 @@ fn all_fly(world: &WorldResult) -> bool {
 }
 
 #[test]
-fn the_robot_of_a_killed_agent_hovers_until_the_next_one_flies_it() {
+fn the_robot_of_a_killed_agent_hovers_and_a_takeover_changes_only_who_flies() {
     let mut lab = Lab::new("");
     let [one, two, three] = lab.start_agents();
     two.kill();
@@ -126,12 +126,6 @@ fn the_robot_of_a_killed_agent_hovers_until_the_next_one_flies_it() {
     }
     let two = lab.start_agent(2, "");
     lab.until(&[&one, &two, &three], all_fly);
-}
-
-#[test]
-fn a_takeover_changes_who_flies_a_robot_and_nothing_else() {
-    let mut lab = Lab::new("");
-    let [one, two, three] = lab.start_agents();
     let next = lab.start_agent(2, "--takeover");
     let start = Instant::now();
     while lab.server.status().worlds[0].holder_pids[2] != Some(next.pid()) {
@@ -145,7 +139,6 @@ fn a_takeover_changes_who_flies_a_robot_and_nothing_else() {
     }
     let words = format!("lease lost to pid {}", next.pid());
     two.ends(3).check_says(&words);
-    drop((one, three));
 }
 
 #[test]

@@ -401,18 +401,10 @@ fn a_neural_belief_corrects_a_filter() {
     let place = Place::new();
     place.train("filter", &format!("{WORLDS} --steps 40"));
     let learn = format!("{WORLDS} --learner neural --steps 40");
-    let filter = place.flag("filter");
-    for (out, given) in [("alone", ""), ("out", &*filter)] {
-        place.train(out, &format!("{learn} {given}"));
-        place.train(out, &format!("{learn} --resume"));
-        let flags = format!("{} --policies neural_beam,coverage", place.flag(out));
-        agent(&format!("{COMPARED} {flags}")).check_prints("neural_beam");
-    }
-    let first: f64 = place.rows("alone")[0][LOSS].parse().unwrap_or(f64::NAN);
-    assert!(
-        (first - 3_f64.ln()).abs() < 1e-3 || first.is_nan(),
-        "{first}"
-    );
+    place.train("out", &format!("{learn} {}", place.flag("filter")));
+    place.train("out", &format!("{learn} --resume"));
+    let flags = format!("{} --policies neural_beam,coverage", place.flag("out"));
+    agent(&format!("{COMPARED} {flags}")).check_prints("neural_beam");
     let words = "--checkpoint | for the estimator learned";
     place.refuse("other", &format!("{learn} {}", place.flag("out")), words);
 }
@@ -463,18 +455,4 @@ fn an_autoencoder_learns_in_one_world_whose_episodes_end() {
         let server = Server::start(&format!("{WORLD} {flags}"));
         place.refuse("new", &learn(&server, ""), words);
     }
-}
-
-#[test]
-fn worlds_that_are_missing_or_held_and_unknown_learners_are_named() {
-    let place = Place::new();
-    let server = Server::start(SMALL);
-    let _held = server.acquire(0..1);
-    let table = "--worlds 1 --world 4294967294 => no such world: there are worlds 0 to 0; for more, set worlds (--worlds N of a server)
---worlds 1 => pid";
-    place.refuse_all("out", &server.flag(), table);
-    place.set("learner = \"filtre\"\n");
-    let words = "learner: expected one of filter, neural, | \"filtre\"";
-    let flags = format!("{} --takeover --steps 1", server.flag());
-    place.refuse("out", &flags, words);
 }
