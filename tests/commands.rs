@@ -1,6 +1,5 @@
 //! Tests that invalid input to any command leads to an exit code and a one-line error, never to a panic.
 
-use emberwatch_acting::policy;
 use std::time::{Duration, Instant};
 use tests::harness::{
     AGENT, Ended, Folder, LIMIT, Program, SERVER, SMALL, Server, new_instance, repository, run,
@@ -239,13 +238,6 @@ fn an_agent_acts_as_slowly_as_it_is_told() {
     Program::agent(&server.instance, "--steps 3 --steps-per-second 2").ends(0);
     // Without pauses, three steps take a fraction of a second.
     assert!(start.elapsed() >= Duration::from_secs(1), "two pauses");
-}
-
-#[test]
-fn help_lists_the_policies() {
-    for command in ["run", "compare"] {
-        run(AGENT, &format!("{command} --help")).check_prints(policy::help().trim_end());
-    }
 }
 
 #[test]

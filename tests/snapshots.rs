@@ -17,14 +17,14 @@ use tests::wire::{RawClient, Wire};
 const N_MOVES: usize = 6;
 
 /// Flies random paths in a client's worlds and returns the observations.
-fn future(client: &mut Client, seed: u64) -> Vec<Vec<Observation>> {
+fn future(client: &mut Client, seed: u64) -> Vec<Observation> {
     let (mut paths, robots) = (Paths::new(seed), client.robots());
     let mut step = || {
         client
             .step(robots.clone(), &paths.take(N_MOVES, robots.len()))
             .expect("step")
     };
-    (0..5).map(|_| step()).collect()
+    (0..5).flat_map(|_| step()).collect()
 }
 
 /// Runs a command and checks that the server refuses it.
@@ -68,14 +68,11 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     refused(&server, "fork 7 2", "no such world");
     assert_eq!(at(2), at(1));
     let mut copies = [0, 2].map(|robot| server.acquire(robot..robot + 1));
-    let of_second = shown_of(future(&mut second, 4));
+    let of_second = future(&mut second, 4);
     for copy in &mut copies {
-        assert_eq!(shown_of(future(copy, 4)), of_second);
+        assert_eq!(future(copy, 4), of_second);
     }
-    assert_ne!(
-        shown_of(future(&mut copies[0], 6)),
-        shown_of(future(&mut second, 7))
-    );
+    assert_ne!(future(&mut copies[0], 6), future(&mut second, 7));
     for (fork, words) in [
         ("fork 0 2", "busy: held by pid"),
         ("fork 0 3", "no such robot"),
@@ -99,11 +96,6 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     ] {
         refused(&server, &restore(flags), words);
     }
-}
-
-/// Joins the observations of a client with one robot into one list.
-fn shown_of(seen: Vec<Vec<Observation>>) -> Vec<Observation> {
-    seen.into_iter().flatten().collect()
 }
 
 #[test]
