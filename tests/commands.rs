@@ -183,6 +183,7 @@ fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
         (
             "--reveal-model false --publish-truth",
             "run SERVER => does not reveal its model | --model FILE
+train SERVER --out x --worlds 1 --learner decisions --estimator known => --reveal-model true
 compare SERVER --policies coverage => instance | comparing needs the model | --reveal-model true",
         ),
         (
