@@ -1,6 +1,5 @@
 //! Tests of the beliefs that agents publish on their channel.
 
-use crate::trainings::on;
 use emberwatch_protocol::agent_belief::AgentBelief;
 use emberwatch_protocol::message::AgentHeader;
 use emberwatch_protocol::observer::Observer;
@@ -32,7 +31,7 @@ fn until_all(observer: &Observer<AgentHeader>, worlds: std::ops::Range<u32>) -> 
 }
 
 #[test]
-fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
+fn an_agent_shows_what_it_believes_while_observed_and_its_last_belief_in_any_case() {
     let server = Server::start(LIVELY);
     let observer = Observer::agents(&server.instance).expect("observe");
     let mut agent = Program::agent(&server.instance, "--steps 500 --policy known/beam/explore");
@@ -66,16 +65,12 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
     // 0.98.
     let surest = last.belief.iter().copied().fold(0.0, f32::max);
     assert!(surest > 0.9, "{surest}");
-}
-
-#[test]
-fn beliefs_that_nobody_looks_at_are_not_shown() {
-    let server = Server::start(LIVELY);
+    drop(observer);
     let agent = Program::agent(&server.instance, "");
-    agent.until(|| server.step_of(0) > 100);
+    agent.until(|| server.step_of(0) > 600);
     let observer = Observer::agents(&server.instance).expect("observe");
     let header = until_all(&observer, 0..1)[0].header;
-    assert!(header.step > 100, "a belief of an earlier step");
+    assert!(header.step > 600, "a belief that nobody looked at");
     let flown = (header.first_robot, header.n_robots);
     assert_eq!((header.pid, flown), (agent.pid(), (0, 1)));
 }
@@ -89,7 +84,7 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
         let words = format!(
             "compare --policies known/beam/exploit --baseline known/beam/exploit --seeds 0..8 --steps {n_steps} \
              {}",
-            on(&server)
+            server.flag()
         );
         Program::start(AGENT, &words)
     };
@@ -113,7 +108,7 @@ fn a_training_shows_what_it_believes_of_all_its_worlds() {
         "--config {config} --out {} --world 1 --worlds 2",
         folder.word("out")
     );
-    let _training = Program::start(AGENT, &format!("train {} {flags}", on(&server)));
+    let _training = Program::start(AGENT, &format!("train {} {flags}", server.flag()));
     let shown = until_all(&observer, 1..3);
     assert!(shown.iter().all(|shown| shown.header.world > 0));
     for AgentBelief { belief, intent, .. } in &shown {

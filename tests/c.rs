@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use tests::harness::{
-    Ended, Folder, LIMIT, PATIENCE, Program, SERVER, SMALL, Server, eventually, new_instance,
+    Ended, Folder, LIMIT, PATIENCE, Program, SERVER, Server, eventually, new_instance,
     program_path, repository, status,
 };
 
@@ -108,20 +108,6 @@ fn a_server_and_its_failures_have_the_documented_codes() {
 }
 
 #[test]
-fn a_second_copy_of_the_library_is_refused() {
-    let (folder, server) = (Folder::default(), Server::start(SMALL));
-    let copy = folder.word("copy.so");
-    std::fs::copy(library(), &copy).expect("a copy");
-    let arguments = [server.instance.name(), &copy];
-    run(
-        &folder,
-        "tests/programs/second_copy.c",
-        "-std=gnu11",
-        &arguments,
-    );
-}
-
-#[test]
 fn the_examples_fly_in_the_process_and_on_a_server() {
     let (folder, server) = (Folder::default(), Server::start("--seed 7"));
     let instance = [server.instance.name()];
@@ -137,47 +123,18 @@ fn the_examples_fly_in_the_process_and_on_a_server() {
 }
 
 #[test]
-fn the_node_flies_at_10_hz_beside_a_late_teammate() {
-    let flags = "--robots 2 --deadline-millis 20 --burn-in 0";
-    let (folder, server) = (Folder::default(), Server::start(flags));
-    let instance = server.instance.name();
-    let ended = run(&folder, "examples/node.c", "-std=c99", &[instance, "2"]);
-    ended.check_prints("k = 20 after 20 steps");
-}
-
-#[test]
-fn the_node_survives_a_restart_of_its_server() {
+fn the_node_flies_at_10_hz_beside_a_late_teammate_and_survives_a_restart() {
     let (folder, instance) = (Folder::default(), new_instance());
-    let first = Server::start_on(&instance, "--burn-in 0");
+    let flags = "--robots 2 --deadline-millis 20 --burn-in 0";
+    let first = Server::start_on(&instance, flags);
     let arguments = [instance.name(), "4"];
     let node = start(&folder, "examples/node.c", "-std=c99", &arguments);
     let has_flown = || status(&instance).is_ok_and(|status| status.n_steps > 2);
     assert!(eventually(PATIENCE, has_flown), "{}", node.stderr());
     first.kill();
-    let _second = Server::start_on(&instance, "--burn-in 0");
+    let _second = Server::start_on(&instance, flags);
     let ended = node.ends(0);
     ended.check_prints("after 40 steps").check_says("is gone");
-}
-
-/// Needs the Python package, which `scripts/test` installs.
-mod python {
-    use super::*;
-
-    #[test]
-    #[ignore = "needs the Python package"]
-    fn an_observer_in_python_watches_the_node() {
-        let (folder, server) = (Folder::default(), Server::start("--burn-in 0"));
-        let instance = server.instance.name();
-        let watch = format!(
-            "import emberwatch\n\
-             with emberwatch.observe({instance:?}, timeout=20) as frames:\n    \
-             print(max(frame.result.step for frame, _ in zip(frames, range(15))) > 10)\n"
-        );
-        let watcher = Program::start_at(&tests::harness::python(), &["-c", &watch]);
-        let node = start(&folder, "examples/node.c", "-std=c99", &[instance, "3"]);
-        watcher.ends(0).check_prints("True");
-        node.ends(0).check_prints("k = 30 after 30 steps");
-    }
 }
 
 #[test]

@@ -1,25 +1,7 @@
-//! Tests of the number of clients, and of the example client.
+//! The example of a client.
 
 use crate::random_robot::fly_at_random;
-use emberwatch_protocol::Connection;
-use tests::harness::{PATIENCE, Paths, SMALL, Server, send_paths};
-use tests::wire::Wire;
-
-#[test]
-fn a_seventeenth_client_is_told_the_limit_and_others_go_on() {
-    let server = Server::start(SMALL);
-    let mut holder = server.acquire(0..1);
-    let others: Vec<Wire> = (0..15).map(|_| Wire::open(&server.instance)).collect();
-    let refused = Connection::open(&server.instance, "tests", PATIENCE);
-    let problem = refused.err().expect("a seventeenth client").to_string();
-    assert!(
-        problem.contains("at most 16 clients at a time"),
-        "{problem}"
-    );
-    send_paths(&mut holder, Paths::new(0).next(6));
-    drop(others);
-    server.connect();
-}
+use tests::harness::{SMALL, Server};
 
 #[test]
 fn the_example_of_a_client_flies_an_episode() {

@@ -1,8 +1,9 @@
 //! Tests that invalid input to any command leads to an exit code and a one-line error, never to a panic.
 
-use emberwatch_acting::policy;
 use std::time::{Duration, Instant};
-use tests::harness::{AGENT, Ended, LIMIT, Program, SERVER, SMALL, Server, new_instance, run};
+use tests::harness::{
+    AGENT, Ended, Folder, LIMIT, Program, SERVER, SMALL, Server, new_instance, repository, run,
+};
 
 /// Flags of a very short comparison.
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
@@ -22,45 +23,55 @@ const WRONG_SERVER_FLAGS: &str = r#"
 --config / => config file /: Is a directory
 --config /dev/zero => config file /dev/zero: expected at most 16777216 bytes
 --bogus => --bogus
-dance => dance
---worlds 1024 --height 4096 --width 4096 => memory: expected | MiB for 1024 worlds of 4096 x 4096 cells | got
 status --instance nobody => no server on instance "nobody"
 stop --instance nobody => no server on instance "nobody"
-stop --json => --json
+record => --out
+record --out / => --out / | --force
+record --out /no/such => --out /no/such: No such file
+record --out /dev/null => --out | expected a new file | --force
+record --worlds x --out o => --worlds | 'x'
 "#;
 
 /// Invalid flags of the agent, and words of the resulting error.
 const WRONG_AGENT_FLAGS: &str = r#"
 run --instance nobody --wait 0 => no server on instance "nobody"
 run --wait soon => --wait | expected a number of seconds
-run --instance a/b => instance name | "a/b"
-run --steps -1 => -1
 run --steps-per-second 0.5 => --steps-per-second | expected 1 or more steps per second, got "0.5"
 run --robots 3..3 => --robots | FIRST below END
 run --robots some => --robots | expected FIRST..END
-run --team oracle => --team | alone, shared, joint
 run --model no.toml => model file no.toml | No such file | expected a file, or one of | wildfire, wildfire-burnout
 run --checkpoint /dev/zero => checkpoint /dev/zero: expected a regular file
 run --config no.toml => config file no.toml | No such file
-run --preset lab => --preset | default, paper
 run --prior none => --prior | simulated, initial, uniform
 run --beam-width 0 => beam_width: expected 1 to 10000, got 0
 run --instance nobody --policy ash => policy: expected one of random_walk | BELIEF/PLANNER/GOAL | got "ash"
 run --instance nobody --policy known/beam/ash --wait 0 => no server on instance "nobody"
 run --instance nobody --policy known/beam/ash --model wildfire => "known/beam/ash": goal: expected one of | fire, got "ash"
 compare --seeds 8..0 => --seeds | FIRST below END
-compare --seeds 3 => --seeds | FIRST..END
-compare --steps 0 => --steps | 1..=10000000
 compare --robots 1,65 => --robots | expected 1 to 64
-train --out x --robots 1,2 => '1,2' | --robots | expected 1 to 64
 compare --height 4 --burn-in 1 --policies coverage,coverage => each name once | got "coverage" twice
 compare --height 4 --burn-in 1 --baseline ash => --baseline | expected one of | got "ash"
-compare --height 0 => '0' | --height | expected 1 to 4096
 compare --instance nobody => no server on instance "nobody"
-compare TINY --policies coverage,ash => policy: expected one of random_walk | got "ash"
+compare --checkpoint no/such => checkpoint no/such: No such file
+train => --out
+train --out /proc/no => create /proc/no
+train --out OUT --worlds 0 => --worlds | 1..=1024
+train --out OUT --instance nobody => no server on instance "nobody"
+train --out OUT --instance x --height 9 => --instance | --height
+train --out OUT --learner filtre => --learner | filter | 'filtre'
+train --out OUT --world 3 => --instance
+train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: No such file
 compare --instance x --height 9 => --instance | --height
-compare --instance x --robots 2 => --instance | --robots
 compare --task small --moves 9 => moves: expected to be left out, as the task decides it, got 9
+suite --tasks ash => task ash: No such file | expected a file, or one of wildfire, small
+suite --tasks small,jacksboro --out OUT --policies coverage,known/beam/xyz => policy "known/beam/xyz": goal: expected one of | got "xyz"
+suite --policies bem => policy: expected one of | got "bem"
+suite --tasks small --checkpoints no/such => --checkpoints: expected a folder, got no/such
+suite --train => --checkpoints
+suite --checkpoints runs --train-steps 5 => --train
+leaderboard --entries no/such => expected a folder of entries at no/such
+leaderboard --policy mine => --add
+leaderboard --add x --policy mine => --by
 compare TINY --csv /proc/no/file.csv => create /proc/no
 compare TINY --csv / => --csv: write /: expected a regular file, got a folder
 compare TINY --csv /dev/null => --csv: write /dev/null: expected a regular file
@@ -93,7 +104,7 @@ pub fn agent(arguments: &str) -> Ended {
     ended
 }
 
-/// Checks every line `flags => words | words` of a table. In the flags, `TINY` stands for [`TINY`].
+/// Checks every line `flags => words | words` of a table. `TINY` stands for [`TINY`].
 pub fn check_table(program: &str, table: &str) {
     for line in table.trim().lines() {
         let (flags, words) = line.split_once(" => ").expect("flags and words");
@@ -104,34 +115,88 @@ pub fn check_table(program: &str, table: &str) {
 #[test]
 fn wrong_flags_of_the_programs_are_named() {
     check_table(SERVER, WRONG_SERVER_FLAGS);
-    check_table(AGENT, WRONG_AGENT_FLAGS);
+    let folder = Folder::default();
+    check_table(
+        AGENT,
+        &WRONG_AGENT_FLAGS.replace("OUT", &folder.word("out")),
+    );
+    for (flag, text, words) in [
+        (
+            "--config",
+            "wrolds = 3\n",
+            "wrolds: expected the name of a setting",
+        ),
+        ("--config", "worlds = = 3\n", "config file"),
+        ("--model", "", "missing field"),
+    ] {
+        let path = folder.write("wrong.toml", text);
+        check(
+            SERVER,
+            &format!("{flag} {path} --check"),
+            &format!("{path} | {words}"),
+        );
+    }
+}
+
+#[test]
+fn checked_settings_are_accepted_as_a_file() {
+    let folder = Folder::default();
+    let model = repository().join("config/models/road-ice.toml");
+    for flags in [
+        "--start 3,5 --worlds 7 --coverage client --publish-truth --reveal-model false",
+        "--start random --seed 9007199254740993 --max-steps 12 --burn-in 0",
+        &format!("--model {} --height 24 --width 40", model.display()),
+    ] {
+        let first = run(SERVER, &format!("--check {flags}")).check(0);
+        let path = folder.write("settings.toml", &first.stdout);
+        let second = run(SERVER, &format!("--check --config {path}")).check(0);
+        assert_eq!(second.stdout, first.stdout);
+    }
+}
+
+#[test]
+fn worlds_in_which_nothing_pays_or_burns_are_warned_of_once() {
+    let folder = Folder::default();
+    let wildfire = include_str!("../config/models/wildfire.toml");
+    let [pays, free] = [("pays", "reward = -1.0, "), ("free", "")].map(|(name, reward)| {
+        let model = wildfire.replace("reward = 1.0, ", reward);
+        assert!(model != wildfire);
+        folder.write(name, model)
+    });
+    let none_burns = "no cell is in the state with the highest reward";
+    let lively = "--worlds 3 --model wildfire-small --height 16 --width 16 --burn-in";
+    for (flags, words, n_warnings) in [
+        (format!("{SMALL} --model {pays}"), "no state pays", 0),
+        (format!("{SMALL} --model {free}"), "no state pays", 1),
+        (format!("{lively} 0"), none_burns, 1),
+        (format!("{lively} 3000"), none_burns, 0),
+    ] {
+        let log = Server::start(&flags).program.stderr();
+        assert_eq!(log.matches(words).count(), n_warnings, "{log}");
+    }
+    agent(&format!("compare {TINY} --model {free}")).check_says("no state pays");
 }
 
 #[test]
 fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
     for (settings, table) in [
         (
-            "--reveal-model false",
-            "run SERVER --world 1 => no such world | worlds 0 to 0
-run SERVER => does not reveal its model | --model FILE",
-        ),
-        (
             "--reveal-model false --publish-truth",
-            "compare SERVER --policies coverage => instance | comparing needs the model | --reveal-model true",
-        ),
-        (
-            "--publish-truth",
-            "run SERVER --robots 0..2 => robots: expected a part of the world's robots 0..1, got 0..2
-run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\"",
+            "run SERVER => does not reveal its model | --model FILE
+train SERVER --out x --worlds 1 --learner decisions --estimator known => --reveal-model true
+compare SERVER --policies coverage => instance | comparing needs the model | --reveal-model true",
         ),
         (
             "",
-            "compare SERVER --policies coverage,oracle_beam => oracle_beam | --publish-truth",
+            "run SERVER --world 1 => no such world | worlds 0 to 0
+run SERVER --robots 0..2 => robots: expected a part of the world's robots 0..1, got 0..2
+run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\"
+compare SERVER --policies coverage,oracle_beam => oracle_beam | --publish-truth
+train SERVER --out x --worlds 1 --world 4294967294 => no such world: there are worlds 0 to 0",
         ),
     ] {
         let server = Server::start(&format!("{SMALL} {settings}"));
-        let flag = format!("--instance {}", server.instance.name());
-        check_table(AGENT, &table.replace("SERVER", &flag));
+        check_table(AGENT, &table.replace("SERVER", &server.flag()));
     }
 }
 
@@ -139,7 +204,7 @@ run SERVER --policy known/beam/ash => goal: expected one of | fire, got \"ash\""
 fn status_and_a_second_server_report_the_first() {
     let server = Server::start(&format!("{SMALL} --worlds 2 --seed 40"));
     let words = format!("already running, as pid {}", server.program.pid());
-    let flags = format!("--instance {}", server.instance.name());
+    let flags = server.flag();
     check(SERVER, &flags, &words);
     let _client = server.acquire(1..2);
     let people = server.command("status").check(0);
@@ -174,13 +239,6 @@ fn an_agent_acts_as_slowly_as_it_is_told() {
     Program::agent(&server.instance, "--steps 3 --steps-per-second 2").ends(0);
     // Without pauses, three steps take a fraction of a second.
     assert!(start.elapsed() >= Duration::from_secs(1), "two pauses");
-}
-
-#[test]
-fn help_lists_the_policies() {
-    for command in ["run", "compare"] {
-        run(AGENT, &format!("{command} --help")).check_prints(policy::help().trim_end());
-    }
 }
 
 #[test]

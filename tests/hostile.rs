@@ -4,12 +4,13 @@
 use emberwatch_protocol::Connection;
 use emberwatch_protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
 use emberwatch_protocol::connection::ConnectionError;
-use emberwatch_protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
+use emberwatch_protocol::control::MAX_CONTROL_BYTES;
 use emberwatch_protocol::message::{Status, StepRequest};
 use emberwatch_protocol::observer::Observer;
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use std::time::Duration;
-use tests::harness::{Paths, Server, eventually, send_paths};
+use tests::fuzz::TARGETS;
+use tests::harness::{ENDLESS, PATIENCE, Server, eventually, new_instance};
 use tests::siege::{FLAGS, besiege};
 use tests::wire::{RawClient, Wire, client, control_header, step_body, step_header};
 
@@ -54,7 +55,7 @@ fn fly_second(server: &Server, wire: &Wire, lease: u64) -> Status {
 
 #[test]
 fn requests_whose_answers_nobody_reads_disturb_nobody() {
-    besiege(|server, _| {
+    besiege(|server| {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
         for round in 0..1_000 {
@@ -71,36 +72,23 @@ fn requests_whose_answers_nobody_reads_disturb_nobody() {
 }
 
 #[test]
-fn abandoned_requests_during_a_reset_leak_nothing() {
-    let server = Server::start_with_endless_resets("");
-    let mut bystander = server.acquire(0..1);
+fn abandoned_requests_during_a_burn_in_leak_nothing() {
+    let flags = format!("--burn-in {ENDLESS}");
+    let server = Server::start_without_waiting(&new_instance(), &flags);
+    server.program.wait_for_words("serving");
     let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1..2).lease;
-    let send = |text: String| {
-        wire.send_control(control_header(0), text.as_bytes())
-            .expect("send")
-    };
-    let reset = send(format!(
-        r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1}}]}}"#
-    ));
-    server.program.until(|| server.status().worlds[1].resetting);
-    drop(reset);
-    for step in 1..=50 {
-        let renew = send(format!(r#"{{"op":"renew","lease":{lease}}}"#));
-        assert_eq!(
-            send_paths(&mut bystander, Paths::new(0).next(6)).world.step,
-            step
-        );
-        server.status();
-        drop(renew);
+    let acquire = br#"{"op":"acquire","first_robot":0,"n_robots":1,"takeover":true}"#;
+    for _ in 0..50 {
+        let waiting = wire.send_control(control_header(0), acquire);
+        let is_held = || server.holder() == Some(std::process::id());
+        server.program.until(is_held);
+        drop(waiting.expect("send"));
     }
-    let holders = &server.status().worlds[1].holder_pids;
-    assert_eq!(*holders, [Some(std::process::id())]);
 }
 
 #[test]
 fn held_samples_limit_only_their_holder() {
-    besiege(|server, _| {
+    besiege(|server| {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
         let mut held = Vec::new();
@@ -124,42 +112,8 @@ fn held_samples_limit_only_their_holder() {
 }
 
 #[test]
-fn old_leases_and_numbers_open_nothing_again() {
-    besiege(|server, stolen| {
-        let (wire, other) = (Wire::open(&server.instance), Wire::open(&server.instance));
-        let mut old = Vec::new();
-        for k in 0..10 {
-            let lease = wire.acquire(1..3).lease;
-            let status = |from: &Wire| from.status_of(second_robot(lease), &body(k)).0;
-            // A repeated request is late.
-            assert_eq!(status(&wire), Status::Ok);
-            assert_eq!(status(&wire), Status::Late);
-            assert_eq!(status(&other), Status::NoLease);
-            assert_eq!(wire.ask(&Request::Release { lease }), Reply::Done);
-            old.push(lease);
-            for (&lease, from) in old.iter().flat_map(|it| [(it, &wire), (it, &other)]) {
-                let status = from.status_of(second_robot(lease), &body(k + 1)).0;
-                let renewed = from.ask(&Request::Renew { lease }).status();
-                assert_eq!([status, renewed], [Status::LeaseLost; 2]);
-            }
-        }
-        // Requests all three worlds with a lease on two of them, then the victim's world with the same lease.
-        let lease = wire.acquire(1..3).lease;
-        let all = StepRequest {
-            n_robots: 3,
-            ..step_header(lease, 6)
-        };
-        let status = wire.status_of(all, &step_body(&[0, 10, 0], &[3; 18]));
-        assert_eq!(status.0, Status::NoLease);
-        let status = wire.status_of(step_header(stolen, 6), &body(server.step_of(0)));
-        assert_eq!(status.0, Status::NoLease);
-        assert_eq!(server.step_of(1), 10);
-    });
-}
-
-#[test]
 fn half_open_connections_use_only_their_own_slots() {
-    besiege(|server, _| {
+    besiege(|server| {
         for _ in 0..4 {
             let mut ports = Vec::new();
             // The victim occupies one of the client slots.
@@ -173,8 +127,10 @@ fn half_open_connections_use_only_their_own_slots() {
                 let listener = services.listener(Channel::WakeClient).expect("a listener");
                 ports.push((step.expect("a place"), listener, node));
             }
-            let crowded = Wire::try_open(&server.instance);
-            assert!(crowded.is_err(), "a place too many");
+            let crowded = Connection::open(&server.instance, "tests", PATIENCE);
+            let problem = crowded.err().expect("a place too many").to_string();
+            let words = "at most 16 clients at a time";
+            assert!(problem.contains(words), "{problem}");
         }
         server.acquire(1..3);
     });
@@ -182,7 +138,7 @@ fn half_open_connections_use_only_their_own_slots() {
 
 #[test]
 fn observers_that_come_and_go_leave_nothing() {
-    besiege(|server, _| {
+    besiege(|server| {
         for _ in 0..3 {
             let observe = |_| Observer::frames(&server.instance).expect("a place");
             let kept: Vec<_> = (0..MAX_OBSERVERS).map(observe).collect();
@@ -235,7 +191,7 @@ fn messages_of_any_length_get_short_replies() {
         3 * MAX_CONTROL_BYTES,
     ];
     texts.extend(lengths.map(|length| (" ".repeat(length), malformed)));
-    besiege(|server, _| {
+    besiege(|server| {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1..2).lease;
         for (text, expected) in &texts {
@@ -244,6 +200,15 @@ fn messages_of_any_length_get_short_replies() {
             assert_eq!(reply.status, *expected as u32, "{begin:?}");
             assert!(got <= 16 << 10, "{got} bytes in answer to {begin:?}");
             let refused = wire.status_of(second_robot(lease), text.as_bytes());
+            assert_eq!(refused, (Status::WrongLength, 8 + 6));
+        }
+        let files = TARGETS
+            .iter()
+            .flat_map(|target| target.corpus().expect("its corpus"));
+        let ends_server = |file: &[u8]| file.ends_with(br#"{"op":"shutdown"}"#);
+        for file in files.filter(|file| !ends_server(file)) {
+            wire.control(control_header(1), &file);
+            let refused = wire.status_of(second_robot(lease), &file);
             assert_eq!(refused, (Status::WrongLength, 8 + 6));
         }
     });

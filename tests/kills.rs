@@ -18,7 +18,7 @@ use tests::meter::all_under;
 const FLAGS: &str = "--burn-in 0 --height 8 --width 8 --moves 4";
 
 /// Starts programs and kills them. Returns all their instances and process ids, after all these processes have ended.
-fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, HashSet<u32>) {
+fn kill_in_a_loop(seed: u64, n_kills: usize) -> (Vec<Instance>, HashSet<u32>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let instances: Vec<Instance> = (0..10).map(|_| new_instance()).collect();
     let began = Instant::now();
@@ -37,7 +37,7 @@ fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, Ha
                 (server.program, 0..20_000)
             }
             1 => {
-                let kind = rng.random_range(0..n_kinds);
+                let kind = rng.random_range(0..3);
                 (connect(&running.instance, &folder, kind), 1..longest / 2)
             }
             _ => {
@@ -51,7 +51,7 @@ fn kill_in_a_loop(seed: u64, n_kills: usize, n_kinds: u32) -> (Vec<Instance>, Ha
     (instances, killed)
 }
 
-/// Starts a client, an observer, an agent, or a Python client that has loaded its modules.
+/// Starts a client, an observer or an agent.
 fn connect(instance: &Instance, folder: &Folder, kind: u32) -> Program {
     let name = instance.name();
     match kind {
@@ -61,16 +61,7 @@ fn connect(instance: &Instance, folder: &Folder, kind: u32) -> Program {
             let flags = format!("record --force --instance {name} --out {file}");
             Program::start(SERVER, &flags)
         }
-        2 => Program::agent(instance, "--takeover --policy coverage"),
-        _ => {
-            let script = format!(
-                "import emberwatch, sys, signal; print('connecting', file=sys.stderr, flush=True); \
-                 client = emberwatch.connect({name:?}); signal.pause()"
-            );
-            let program = Program::start_python(&script);
-            program.wait_for_words("connecting");
-            program
-        }
+        _ => Program::agent(instance, "--takeover --policy coverage"),
     }
 }
 
@@ -92,10 +83,10 @@ fn is_of(path: &Path, pids: &HashSet<u32>) -> bool {
     })
 }
 
-fn kill(n_loops: u64, n_kills: usize, n_kinds: u32) {
+fn kill(n_loops: u64, n_kills: usize) {
     let (mut instances, mut killed) = (Vec::new(), HashSet::new());
     std::thread::scope(|scope| {
-        let start = |seed| scope.spawn(move || kill_in_a_loop(seed, n_kills, n_kinds));
+        let start = |seed| scope.spawn(move || kill_in_a_loop(seed, n_kills));
         let loops: Vec<_> = (0..n_loops).map(start).collect();
         for (names, pids) in loops.into_iter().map(|one| one.join().expect("a loop")) {
             instances.extend(names);
@@ -129,13 +120,13 @@ fn kill(n_loops: u64, n_kills: usize, n_kinds: u32) {
 
 #[test]
 fn killed_programs_leave_nothing_in_the_way() {
-    kill(3, 30, 3);
+    kill(3, 30);
 }
 
 #[test]
 #[ignore = "takes minutes"]
 fn a_thousand_killed_programs_leave_nothing_in_the_way() {
-    kill(5, 200, 4);
+    kill(5, 200);
 }
 
 #[test]

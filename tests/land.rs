@@ -1,23 +1,15 @@
-//! Tests of maps, no-fly cells and a wide sensor on a running server.
+//! A running server with maps, no-fly cells and a wide sensor.
 
 use crate::commands::{agent, check};
-use crate::trainings::on;
 use emberwatch_protocol::Model;
 use ndarray::Array2;
 use ndarray_npy::NpzWriter;
 use std::io::Cursor;
 use tests::harness::{Folder, SERVER, Server, run};
 
-const N_MOVES: usize = 6;
-
-/// Returns a map of 7 x 9 cells as TOML.
-fn map(value: impl Fn(usize, usize) -> usize) -> String {
-    let row = |row| Vec::from_iter((0..9).map(|col| value(row, col)));
-    format!("{:?}", Vec::from_iter((0..7).map(row)))
-}
-
-/// Writes a model with a map of fuel, a sensor radius and a wall of no-fly cells with a gap.
-fn write_model(folder: &Folder, radius: usize) -> String {
+/// Returns the flags of a server on a land of 7 x 9 cells: a model with a map of fuel, a sensor radius, and the no-fly
+/// cells for which `is_closed` holds.
+fn land(folder: &Folder, radius: usize, is_closed: fn(usize, usize) -> bool) -> String {
     let burnout = Model::built_in("wildfire-burnout").expect("built in");
     let mut file = burnout.file().clone();
     file.name = "land".into();
@@ -27,26 +19,23 @@ fn write_model(folder: &Folder, radius: usize) -> String {
     let mut archive = NpzWriter::new(Cursor::new(Vec::new()));
     archive.add_array("fuel", &fuel).expect("an array");
     let archive = archive.finish().expect("an archive");
-    std::fs::write(folder.path("land.npz"), archive.into_inner()).expect("a file");
+    folder.write("land.npz", archive.into_inner());
     let rest = toml::to_string(&file).expect("TOML");
-    let wall = map(|row, col| usize::from(col == 4 && row != 3));
+    let row = |row| Vec::from_iter((0..9).map(|col| u8::from(is_closed(row, col))));
+    let no_fly = Vec::from_iter((0..7).map(row));
     let text =
-        format!("maps = \"land.npz\"\nno_fly = {wall}\n{rest}\n[sensor]\nradius = {radius}\n");
-    folder.write("land.toml", text)
-}
-
-fn flags(model: &str) -> String {
-    format!(
-        "--model {model} --height 7 --width 9 --moves {N_MOVES} --burn-in 3000 --robots 2 --publish-truth --start random"
-    )
+        format!("maps = \"land.npz\"\nno_fly = {no_fly:?}\n{rest}\n[sensor]\nradius = {radius}\n");
+    let model = folder.write("land.toml", text);
+    format!("--model {model} --height 7 --width 9 --moves 6 --burn-in 3000")
 }
 
 #[test]
-fn hello_describes_a_land_agents_act_on_it_and_another_refuses_its_snapshot() {
+fn agents_act_on_a_land_that_hello_describes_and_another_refuses_its_snapshot() {
     let folder = Folder::default();
-    let model = write_model(&folder, 2);
+    let wall = |row, col| col == 4 && row != 3;
+    let more = "--robots 2 --publish-truth --start random";
     let snapshot = folder.word("a.snapshot");
-    let server = Server::start(&flags(&model));
+    let server = Server::start(&format!("{} {more}", land(&folder, 2, wall)));
     server.command(&format!("snapshot {snapshot}")).check(0);
     let info = server.info();
     let airspace = info.airspace().expect("an airspace");
@@ -61,30 +50,21 @@ fn hello_describes_a_land_agents_act_on_it_and_another_refuses_its_snapshot() {
         "known+spatial/beam/exploit",
         "oracle_ahead",
     ] {
-        agent(&format!(
-            "run {} --policy {policy} --steps 3 --team joint",
-            on(&server)
-        ));
+        let flags = format!("--policy {policy} --steps 3 --team joint");
+        agent(&format!("run {} {flags}", server.flag()));
     }
-    let other = flags(&write_model(&folder, 1));
-    let restore = format!("--restore {snapshot}");
-    check(SERVER, &format!("{other} {restore}"), "model: expected");
-}
-
-#[test]
-fn cells_that_no_fly_cells_cut_off_are_told_of() {
-    let folder = Folder::default();
-    let model = write_model(&folder, 2);
-    let land = format!("--model {model} --height 7 --width 9 --burn-in 0");
-    let text = folder.text("land.toml");
-    let (head, rest) = text.split_once("no_fly = ").expect("a map");
-    let (_, rest) = rest.split_once('\n').expect("its end");
-    // A map in which no-fly cells enclose two free cells.
-    let pocket = map(|row, col| {
-        usize::from(row < 3 && col < 4 && (row, col) != (1, 1) && (row, col) != (1, 2))
-    });
-    folder.write("land.toml", format!("{head}no_fly = {pocket}\n{rest}"));
-    let checked = run(SERVER, &format!("--check {land} --start 1,2")).check(0);
+    let other = land(&folder, 1, wall);
+    check(
+        SERVER,
+        &format!("{other} {more} --restore {snapshot}"),
+        "model: expected",
+    );
+    // No-fly cells enclose two free cells.
+    let pocket = |row, col| row < 3 && col < 4 && (row, col) != (1, 1) && (row, col) != (1, 2);
+    let checked = run(
+        SERVER,
+        &format!("--check {} --start 1,2", land(&folder, 2, pocket)),
+    );
     for words in [
         "no-fly cells cut off 2 of 53 free cells (3.77 %)",
         "start: no-fly cells enclose (1, 2): robots that start there reach 2 of 53 free cells",

@@ -5,12 +5,8 @@ use emberwatch_protocol::Connection;
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::control::Request;
 use rustix::pipe::fcntl_setpipe_size;
-use rustix::process::{Pid, Signal, kill_process};
-use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-use rustix::termios::{Action, tcflow};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Write, pipe};
-use std::net::TcpStream;
+use std::io::{Read, Write, pipe};
 use std::os::fd::OwnedFd;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use tests::harness::{
@@ -23,11 +19,6 @@ const PIPE: usize = 4096;
 /// Number of refused requests whose log exceeds what the server keeps for a reader that pauses.
 const N_REFUSED: usize = 14_000;
 
-/// The flag of a server or dashboard that must not outlive a failed test.
-fn ends_with_us() -> String {
-    format!("--exit-with {}", std::process::id())
-}
-
 fn start(name: &str, arguments: &str, stdout: Stdio, stderr: impl Into<Stdio>) -> Child {
     let mut command = Command::new(program_path(name));
     command
@@ -37,25 +28,19 @@ fn start(name: &str, arguments: &str, stdout: Stdio, stderr: impl Into<Stdio>) -
     command.spawn().expect("start the program")
 }
 
+/// Starts a server that does not outlive a failed test.
+fn start_server(instance: &Instance, stderr: OwnedFd) -> Child {
+    let (name, pid) = (instance.name(), std::process::id());
+    let flags = format!("--instance {name} {SMALL} --exit-with {pid}");
+    start(SERVER, &flags, Stdio::null(), stderr)
+}
+
 /// Waits until a program ends. Kills it if that takes too long.
 fn wait(mut child: Child) -> ExitStatus {
     if !eventually(PATIENCE, || !matches!(child.try_wait(), Ok(None))) {
         let _ = child.kill();
     }
     child.wait().expect("a child process")
-}
-
-/// A terminal in which Ctrl-S was pressed.
-fn paused_terminal() -> (OwnedFd, OwnedFd) {
-    let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
-    grantpt(&terminal).expect("a terminal");
-    unlockpt(&terminal).expect("a terminal");
-    let name = ptsname(&terminal, Vec::new()).expect("a name");
-    let name = name.to_str().expect("ASCII");
-    let end = File::options().read(true).write(true).open(name);
-    let end = end.expect("open the terminal");
-    tcflow(&end, Action::OOff).expect("pause");
-    (terminal, end.into())
 }
 
 /// A full pipe, and its reader, which must stay open.
@@ -76,53 +61,18 @@ fn connect(instance: &Instance) -> Connection {
     connection.expect("checked above")
 }
 
-/// Reads the page of a dashboard.
-fn page(url: &str) -> String {
-    let address = url
-        .trim()
-        .trim_start_matches("http://")
-        .trim_end_matches('/');
-    let mut stream = TcpStream::connect(address).expect("connect");
-    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
-    // A request for another host is refused and logged.
-    let request = format!("GET / HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
-    stream.write_all(request.as_bytes()).expect("request");
-    let mut text = String::new();
-    stream.read_to_string(&mut text).expect("a page");
-    text
-}
-
 #[test]
 fn an_unread_log_stops_no_program() {
-    for unread in [full_pipe, paused_terminal] {
-        let (_reader, log) = unread();
-        let stderr = || log.try_clone().expect("a file descriptor");
-        let instance = new_instance();
-        let flags = format!("--instance {} {SMALL} {}", instance.name(), ends_with_us());
-        let server = start(SERVER, &flags, Stdio::null(), stderr());
-        let mut connection = connect(&instance);
-
-        let flags = format!(
-            "--instance {} --listen 127.0.0.1:0 {}",
-            instance.name(),
-            ends_with_us()
-        );
-        let mut dashboard = start("emberwatch-dashboard", &flags, Stdio::piped(), stderr());
-        let mut url = String::new();
-        let out = dashboard.stdout.take().expect("piped");
-        BufReader::new(out).read_line(&mut url).expect("a line");
-        assert!(page(&url).contains("200 OK"), "{url}");
-        let pid = Pid::from_raw(dashboard.id() as i32).expect("a process id");
-        kill_process(pid, Signal::TERM).expect("stop the dashboard");
-        assert!(wait(dashboard).success());
-
-        let agent = start(AGENT, &format!("compare {TINY}"), Stdio::null(), stderr());
-        assert!(wait(agent).success());
-
-        let stopped = connection.control(&Request::Shutdown {}, PATIENCE);
-        stopped.expect("an answer");
-        assert!(wait(server).success());
-    }
+    let (_reader, log) = full_pipe();
+    let stderr = || log.try_clone().expect("a file descriptor");
+    let instance = new_instance();
+    let server = start_server(&instance, stderr());
+    let mut connection = connect(&instance);
+    let agent = start(AGENT, &format!("compare {TINY}"), Stdio::null(), stderr());
+    assert!(wait(agent).success());
+    let stopped = connection.control(&Request::Shutdown {}, PATIENCE);
+    stopped.expect("an answer");
+    assert!(wait(server).success());
 }
 
 #[test]
@@ -130,8 +80,7 @@ fn dropped_lines_are_counted_and_reported() {
     let (reader, writer) = full_pipe();
     let mut reader = File::from(reader);
     let instance = new_instance();
-    let flags = format!("--instance {} {SMALL} {}", instance.name(), ends_with_us());
-    let server = start(SERVER, &flags, Stdio::null(), writer);
+    let server = start_server(&instance, writer);
     let mut connection = connect(&instance);
     for _ in 0..N_REFUSED {
         let refused = connection.control(&Request::Renew { lease: 1 }, PATIENCE);
@@ -155,7 +104,7 @@ fn dropped_lines_are_counted_and_reported() {
 #[test]
 fn readers_that_leave_end_programs_silently() {
     let server = Server::start(SMALL);
-    let instance = format!("--instance {}", server.instance.name());
+    let instance = server.flag();
     for (program, arguments) in [
         (SERVER, "--help"),
         (SERVER, "--check"),

@@ -7,14 +7,12 @@
 //! that need Python (`scripts/test` installs it).
 
 mod agent_beliefs;
-mod autoencoder;
 mod c;
 mod clients;
 mod commands;
 mod compare;
 mod compliance;
 mod crash;
-mod files;
 mod frames;
 mod handover;
 mod hostile;
@@ -34,7 +32,4 @@ mod snapshots;
 mod suite;
 mod tasks;
 mod teams;
-mod trained_decisions;
-mod trained_neural;
 mod training;
-mod trainings;

@@ -4,7 +4,7 @@
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
 use emberwatch_protocol::channels::Instance;
 use emberwatch_protocol::message::{ControlRequest, StepRequest};
-use serde_json::{Value, json};
+use serde_json::json;
 use std::cell::RefCell;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
@@ -45,8 +45,8 @@ impl PythonWire {
     ) -> (R, Vec<u8>) {
         let request = json!({
             "service": service,
-            "header": hex(bytes_of(header)),
-            "payload": hex(payload),
+            "header": bytes_of(header),
+            "payload": payload,
         });
         let mut requests = self.requests.borrow_mut();
         let requests = requests.as_mut().expect("open until it is dropped");
@@ -54,9 +54,9 @@ impl PythonWire {
         let mut line = String::new();
         let mut answers = self.answers.borrow_mut();
         answers.read_line(&mut line).expect("hear the client");
-        let answer: Value = serde_json::from_str(&line).expect("an answer by the client");
-        let bytes = |key: &str| bytes_of_hex(answer[key].as_str().expect("hexadecimal"));
-        (pod_read_unaligned(&bytes("header")), bytes("payload"))
+        let answer = serde_json::from_str::<[Vec<u8>; 2]>(&line);
+        let [header, payload] = answer.expect("an answer by the client");
+        (pod_read_unaligned(&header), payload)
     }
 }
 
@@ -84,14 +84,4 @@ impl Drop for PythonWire {
             let _ = process.wait();
         }
     }
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-fn bytes_of_hex(text: &str) -> Vec<u8> {
-    let digits = text.as_bytes().chunks_exact(2);
-    let byte = |digits| u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok();
-    digits.map(|digits| byte(digits).expect("a byte")).collect()
 }

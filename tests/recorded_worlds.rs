@@ -1,7 +1,6 @@
 //! Tests of recorded worlds: servers show and restore them, and agents act there without a known model.
 
 use crate::commands::{agent, check, check_table};
-use crate::trainings::on;
 use emberwatch_agent::benchmark::report::runs_file::read_runs;
 use emberwatch_agent::client::truth::TruthFeed;
 use emberwatch_protocol::Shape;
@@ -81,35 +80,22 @@ impl Place {
     }
 }
 
-fn truth_of(server: &Server) -> TruthFeed {
-    let info = server.info();
-    let shape = Shape::new(info.height, info.width).expect("a shape");
-    TruthFeed::open(&server.instance, shape).expect("truth")
-}
-
-#[test]
-fn hello_tells_of_the_recorded_world_and_keeps_what_it_shall() {
-    let place = Place::new(&[6, 9], (3, 5));
-    let info = Server::start(&place.flags("--states-offset 2")).info();
-    let recorded = info.recorded_world.expect("it is one");
-    assert_eq!((recorded.n_sequences, recorded.n_steps), (2, 3));
-    assert_eq!((info.height, info.width, info.burn_in), (3, 5, 0));
-    assert_eq!(info.model, None);
-    assert_eq!(info.observations, ["dark", "hot", "grey"]);
-    let model = Description::model_of(&recorded.description.expect("revealed"));
-    assert_eq!(model.expect("valid").name(), "lab");
-    let info = Server::start(&place.flags("--reveal-model false")).info();
-    assert_eq!(info.recorded_world.expect("it is one").description, None);
-}
-
 #[test]
 fn a_restored_world_goes_on_and_another_states_file_is_refused() {
-    let (place, other) = (Place::new(&[9, 12], (4, 4)), Place::new(&[9, 13], (4, 4)));
+    let (place, other) = (Place::new(&[9, 12], (3, 5)), Place::new(&[9, 13], (3, 5)));
     let settings = "--states-symmetries --states-offset 3 --start random";
     let server = Server::start(&place.flags(settings));
+    let info = server.info();
+    let recorded = info.recorded_world.expect("it is one");
+    assert_eq!((recorded.n_sequences, recorded.n_steps), (2, 5));
+    assert_eq!((info.height, info.width, info.burn_in), (3, 5, 0));
+    assert_eq!((info.model, &*info.observations[1]), (None, "hot"));
+    let model = Description::model_of(&recorded.description.expect("revealed"));
+    assert_eq!(model.expect("valid").name(), "lab");
     let future = |server: &Server| {
-        let (mut client, truth) = (server.acquire(0..1), truth_of(server));
-        let seen = fly_on(&mut client, 5, 3);
+        let shape = Shape::new(3, 5).expect("a shape");
+        let truth = TruthFeed::open(&server.instance, shape).expect("truth");
+        let seen = fly_on(&mut server.acquire(0..1), 5, 3);
         let last = &seen[2].world;
         let states = truth.states(0..1, &[last.seed], last.step).expect("truth");
         (seen, states)
@@ -118,9 +104,11 @@ fn a_restored_world_goes_on_and_another_states_file_is_refused() {
     let folder = Folder::default();
     let file = folder.word("lab.snapshot");
     server.command(&format!("snapshot {file}")).check(0);
-    let settings = format!("{settings} --restore {file}");
+    let settings = format!("{settings} --restore {file} --reveal-model false");
     let again = Server::start(&place.flags(&settings));
     assert_eq!(future(&again), future(&server));
+    let hidden = again.info().recorded_world.expect("it is one");
+    assert_eq!(hidden.description, None);
     let words = "states: expected 2 sequences of CRC-32 ";
     check(SERVER, &other.flags(&settings), words);
 }
@@ -143,7 +131,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     let results = Folder::default();
     let settings = results.write("agent.toml", small);
     let server = Server::start(&place.flags("--worlds 5 --coverage client"));
-    let act = |words: &str| agent(&format!("{words} {}", on(&server)));
+    let act = |words: &str| agent(&format!("{words} {}", server.flag()));
     let out = results.word("out");
     act(&format!(
         "train --worlds 2 --steps 400 --out {out} --config {settings}"
@@ -166,18 +154,16 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     }
     assert!(!ladder.stdout.contains("| beam_"), "{}", ladder.stdout);
     let no_model = "filters with a model, and recorded worlds have none";
+    let too_long = "--steps: expected at most 23, the length of the shortest episode, got 24";
     for (words, expected) in [
         ("run --policy known+spatial/beam/exploit", no_model),
         (
-            "compare --policies coverage,known/shooting/explore --seeds 0..1",
+            "compare --seeds 0..1 --policies known/shooting/explore",
             no_model,
         ),
-        (
-            "compare --seeds 0..1 --steps 24",
-            "--steps: expected at most 23, the length of the shortest episode, got 24",
-        ),
+        ("compare --seeds 0..1 --steps 24", too_long),
     ] {
-        check(AGENT, &format!("{words} {}", on(&server)), expected);
+        check(AGENT, &format!("{words} {}", server.flag()), expected);
     }
 }
 
@@ -209,10 +195,6 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
     let unpaid = format!("--model {}", folder.write("unpaid.toml", unpaid));
     for (flags, words) in [
         (
-            "",
-            "policy \"known/beam/exploit\" filters with a model, and recorded worlds have none",
-        ),
-        (
             "--model wildfire",
             "--model: expected the recorded states unburnt, burning, burnt, got normal, latent, fire",
         ),
@@ -224,14 +206,14 @@ fn beliefs_of_a_given_model_run_on_recorded_states() {
         check(AGENT, &format!("{compare} {flags}"), words);
     }
     let states = format!("--states {}", place.folder.word(""));
-    let table = "train STATES --model wildfire --out x => model: expected to be left out, as the states file decides it
-compare STATES --height 3 => height: expected to be left out, as the states file decides it
-train STATES --out x --burn-in 3 => burn_in: expected to be left out, as the states file decides it";
-    check_table(AGENT, &table.replace("STATES", &states));
-    let table =
-        "STATES --model wildfire => model: expected to be left out, as the states file decides it
-STATES --states-offset 5 => states_offset: expected 0 to 4
---states-offset 3 => states_offset: expected 0 without a states file
---states no/such.npz => states file no/such.npz: No such file";
-    check_table(SERVER, &table.replace("STATES", &states));
+    let table = format!(
+        "train {states} --model wildfire --out x => model: expected to be left out, as the states file decides it
+compare {states} --height 3 => height: expected to be left out, as the states file decides it"
+    );
+    check_table(AGENT, &table);
+    let table = format!(
+        "{states} --states-offset 5 => states_offset: expected 0 to 4
+--states no/such.npz => states file no/such.npz: No such file"
+    );
+    check_table(SERVER, &table);
 }

@@ -22,12 +22,18 @@ fn is_held_by(server: &Server, agent: &Program) -> bool {
 }
 
 #[test]
-fn an_agent_says_that_its_server_is_gone_and_goes_on_with_the_next() {
+fn an_agent_outlives_a_pause_and_the_end_of_its_server() {
     let instance = new_instance();
-    let server = Server::start_on(&instance, SMALL);
+    let server = Server::start_on(&instance, &format!("{SMALL} --lease-millis 86400000"));
     let agent = start_agent(&instance);
     let acts = |server: &Server| is_held_by(server, &agent) && server.status().n_steps > 0;
     agent.until(|| acts(&server));
+    server.program.stop();
+    agent.wait_for_words("no answer to step");
+    server.program.signal(Signal::CONT);
+    let before = server.status().n_steps;
+    agent.until(|| server.status().n_steps > before + 10);
+    assert!(acts(&server));
     server.kill();
     agent.wait_for_words("is gone; waiting for the server to come back");
     let server = Server::start_on(&instance, SMALL);
@@ -35,19 +41,6 @@ fn an_agent_says_that_its_server_is_gone_and_goes_on_with_the_next() {
     server.command("stop").check(0);
     // An agent without a server still stops on a signal.
     agent.finish();
-}
-
-#[test]
-fn an_agent_outlives_a_pause_of_its_server() {
-    let server = Server::start(&format!("{SMALL} --lease-millis 86400000"));
-    let agent = start_agent(&server.instance);
-    agent.until(|| is_held_by(&server, &agent) && server.status().n_steps > 0);
-    server.program.stop();
-    agent.wait_for_words("no answer to step");
-    server.program.signal(Signal::CONT);
-    let before = server.status().n_steps;
-    agent.until(|| server.status().n_steps > before + 10);
-    assert!(is_held_by(&server, &agent));
 }
 
 #[test]

@@ -4,10 +4,10 @@ It shares no code with the other clients, so that it does not repeat their error
 comments are sections of PROTOCOL.md.
 
 `wire_reference.py INSTANCE` connects and sends the requests of the compliance suite. Each line of
-its standard input is a request, `{"service": "step", "header": "<hex>", "payload": "<hex>"}`. The
-client itself fills in the last 16 bytes of the header, which contain the listener's id. Each line
-of its standard output is an answer, `{"header": "<hex>", "payload": "<hex>"}`. The program fails if
-an answer violates PROTOCOL.md.
+its standard input is a request, `{"service": "step", "header": [...], "payload": [...]}`, with
+bytes as numbers. The client itself fills in the last 16 bytes of the header, which contain the
+listener's id. Each line of its standard output is the header and the payload of an answer. The
+program fails if an answer violates PROTOCOL.md.
 """
 
 import contextlib
@@ -307,10 +307,10 @@ def main() -> None:
     client = Client(sys.argv[1])
     for line in sys.stdin:
         request = json.loads(line)
-        header = bytes.fromhex(request["header"])[:-16] + client.listener
+        header = bytes(request["header"])[:-16] + client.listener
         send = {"step": client.step, "control": client.control}[request["service"]]
-        header, payload = send(header, bytes.fromhex(request["payload"]))
-        print(json.dumps({"header": header.hex(), "payload": payload.hex()}), flush=True)
+        header, payload = send(header, bytes(request["payload"]))
+        print(json.dumps([list(header), list(payload)]), flush=True)
     with turn():
         del client, send
 

@@ -6,12 +6,12 @@
 //! `scripts/bench` measures Gymnasium's AsyncVectorEnv in the same run for comparison.
 
 use emberwatch_protocol::Client;
+use std::io::Write;
 use std::ops::Range;
 use std::sync::Barrier;
 use std::time::{Duration, Instant};
 use tests::harness::{Program, Server};
 use tests::meter::processor_seconds;
-use tests::report::{quantiles, say};
 
 const N_STEPS: usize = 50_000;
 
@@ -116,4 +116,15 @@ fn report_idleness(pid: u32) {
     say(&format!(
         "idle server: {share:.2} % of one core over {pause:?}"
     ));
+}
+
+fn say(line: &str) {
+    let _ = writeln!(std::io::stdout(), "{line}");
+}
+
+/// Returns quantiles of values: 0.5 is the median, 1.0 the maximum.
+fn quantiles<const N: usize>(mut numbers: Vec<f64>, shares: [f64; N]) -> [f64; N] {
+    numbers.sort_unstable_by(f64::total_cmp);
+    let last = numbers.len() - 1;
+    shares.map(|share| numbers[last.min((numbers.len() as f64 * share) as usize)])
 }

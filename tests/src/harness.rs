@@ -10,11 +10,7 @@ use emberwatch_protocol::message::{FrameHeader, RobotResult, WorldResult};
 use emberwatch_protocol::observer::{Observer, Sample};
 use emberwatch_protocol::path::path_from_bytes;
 use emberwatch_protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
-use emberwatch_protocol::settings::WorldSettings;
 use emberwatch_protocol::{Client, Connection, Move};
-use emberwatch_sim::config::ServerConfig;
-use emberwatch_sim::snapshot::{SnapshotWorld, WorldSpec, encode};
-use emberwatch_sim::world::Episode;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -22,7 +18,6 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
-use tempfile::TempDir;
 
 pub use crate::programs::{
     AGENT, Ended, Folder, LIMIT, PATIENCE, Program, SERVER, eventually, program_path, python,
@@ -76,26 +71,6 @@ impl Server {
         }
     }
 
-    /// Starts a server with two worlds of the size of [`SMALL`] at k = 0. If these worlds are reset, the burn-in never
-    /// ends.
-    pub fn start_with_endless_resets(flags: &str) -> Self {
-        let WorldSpec {
-            settings,
-            mut rules,
-        } = small_spec(ENDLESS);
-        rules.burn_in = 0;
-        let episodes = [0, 1].map(|seed| Episode::new(&rules, seed));
-        let worlds = episodes.each_ref().map(SnapshotWorld::Ready);
-        let folder = TempDir::new().expect("a folder for the worlds");
-        let file = folder.path().join("worlds.snapshot");
-        std::fs::write(&file, encode(&settings, &worlds).expect("small")).expect("write");
-        let shape = "--height 5 --width 7 --moves 6 --worlds 2";
-        let file = file.display();
-        Self::start(&format!(
-            "{shape} --burn-in {ENDLESS} --restore {file} {flags}"
-        ))
-    }
-
     pub fn connect(&self) -> Connection {
         Connection::open(&self.instance, "tests", PATIENCE).expect("connect")
     }
@@ -108,6 +83,11 @@ impl Server {
     /// Creates a client that takes over robots of this server.
     pub fn take_over(&self, robots: Range<u32>) -> Client {
         Client::acquire(self.connect(), &takeover(robots)).expect("take over")
+    }
+
+    /// Returns the flag that names this instance.
+    pub fn flag(&self) -> String {
+        format!("--instance {}", self.instance.name())
     }
 
     pub fn info(&self) -> ServerInfo {
@@ -138,10 +118,7 @@ impl Server {
 
     /// Runs a subcommand of the server program on this instance.
     pub fn command(&self, words: &str) -> Ended {
-        run(
-            SERVER,
-            &format!("{words} --instance {}", self.instance.name()),
-        )
+        run(SERVER, &format!("{words} {}", self.flag()))
     }
 
     /// Kills the server with SIGKILL and waits until it has ended.
@@ -174,19 +151,6 @@ pub fn new_instance() -> Instance {
     Instance::new(&name).expect("a plain name")
 }
 
-/// Returns the description of a server with one world of 2 x 3 cells, to be stored in a recording.
-pub fn recorded_info(n_moves: usize, n_robots: u32) -> ServerInfo {
-    let text = r#"{"protocol":3,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":0,"n_worlds":1,"n_robots":0,
-        "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
-        "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
-    let info = serde_json::from_str(text).expect("what a server says");
-    ServerInfo {
-        n_moves,
-        n_robots,
-        ..info
-    }
-}
-
 /// Returns the files of an instance's services.
 pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
     let files = std::fs::read_dir(channel_directory().join("services"));
@@ -194,22 +158,6 @@ pub fn service_files(instance: &Instance) -> Vec<PathBuf> {
     let name = format!("emberwatch/v3/{}/", instance.name());
     let text = |path: &PathBuf| std::fs::read_to_string(path).unwrap_or_default();
     files.filter(|path| text(path).contains(&name)).collect()
-}
-
-/// Returns the settings and rules of the worlds of a [`SMALL`] server.
-pub fn small_spec(burn_in: u64) -> WorldSpec {
-    let config = ServerConfig {
-        world: WorldSettings {
-            height: 5,
-            width: 7,
-            moves: 6,
-            burn_in,
-            ..WorldSettings::default()
-        },
-        ..ServerConfig::default()
-    };
-    let checked = config.check().expect("valid settings");
-    WorldSpec::of(&checked).expect("a valid model")
 }
 
 /// Asks for the server's status over a new connection.

@@ -6,6 +6,5 @@ pub mod fuzz;
 pub mod harness;
 pub mod meter;
 mod programs;
-pub mod report;
 pub mod siege;
 pub mod wire;

@@ -5,7 +5,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 /// Time limit for operations that should take milliseconds. It is shorter than the default duration of a lease, 30 s.
@@ -78,11 +78,6 @@ impl Program {
             AGENT,
             &format!("run --instance {} {flags}", instance.name()),
         )
-    }
-
-    /// Starts Python, with the package installed, on a script.
-    pub fn start_python(script: &str) -> Self {
-        Self::start_at(&python(), &["-c", script])
     }
 
     pub fn start_at(program: &Path, arguments: &[&str]) -> Self {
@@ -239,42 +234,17 @@ pub fn python() -> PathBuf {
     python
 }
 
-/// Returns the path of a program, after checking that it is built from the current sources.
+/// Returns the path of a program, which `cargo build --workspace` makes beside the tests.
 pub fn program_path(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("this program's path");
-    let target = test.ancestors().nth(2).expect("target/<profile>/deps/test");
-    let path = target.join(name);
-    let package = match name {
-        "emberwatch-server" => "env-server",
-        "emberwatch-dashboard" => "clients/dashboard",
-        _ => "agent",
-    };
-    let sources = [package, "protocol"].map(|package| repository().join(package).join("src"));
-    let newest = sources
-        .iter()
-        .filter_map(|folder| newest_change(folder))
-        .max();
-    let built = path
-        .metadata()
-        .and_then(|metadata| metadata.modified())
-        .ok();
+    let path = test
+        .ancestors()
+        .nth(2)
+        .expect("target/<profile>/deps/test")
+        .join(name);
     assert!(
-        built.is_some() && built >= newest,
-        "{name} is missing or older than its source: run `cargo build --workspace`, with the \
-         profile of the tests, before them"
+        path.exists(),
+        "no {name}: run `cargo build --workspace` before the tests"
     );
     path
-}
-
-fn newest_change(path: &Path) -> Option<SystemTime> {
-    if path.is_file() {
-        return path
-            .metadata()
-            .and_then(|metadata| metadata.modified())
-            .ok();
-    }
-    let entries = std::fs::read_dir(path).ok()?.flatten();
-    entries
-        .filter_map(|entry| newest_change(&entry.path()))
-        .max()
 }

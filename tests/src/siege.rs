@@ -32,19 +32,19 @@ struct Holdings {
     own: u64,
 }
 
-/// Starts a server and a victim, and runs an attack that knows the victim's lease. Then checks that the victim was
-/// undisturbed, and that the server holds no more resources than before.
-pub fn besiege(attack: impl FnOnce(&Server, u64)) {
+/// Starts a server and a victim, and runs an attack. Then checks that the victim was undisturbed, and that the server
+/// holds no more resources than before.
+pub fn besiege(attack: impl FnOnce(&Server)) {
     let server = Server::start(FLAGS);
-    let (tell_lease, stolen) = channel();
+    let (began, has_begun) = channel();
     let stop = AtomicBool::new(false);
     let seen = std::thread::scope(|scope| {
-        let victim = scope.spawn(|| live(&server.instance, &tell_lease, &stop));
-        let stolen = stolen.recv_timeout(PATIENCE).expect("a lease");
+        let victim = scope.spawn(|| live(&server.instance, &began, &stop));
+        has_begun.recv_timeout(PATIENCE).expect("a step");
         let before = Holdings::of(server.program.pid());
         // Stops the victim when dropped, because the victim would never end if the attack panicked.
         let stopped = Stop(&stop);
-        attack(&server, stolen);
+        attack(&server);
         check_holdings(server.program.pid(), &before);
         drop(stopped);
         victim.join().expect("the victim lives")
@@ -63,7 +63,7 @@ impl Drop for Stop<'_> {
 }
 
 /// Runs the victim, which steps world 0 until `stop` is set. Returns the payloads of all answers.
-fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec<Vec<u8>> {
+fn live(instance: &Instance, began: &Sender<()>, stop: &AtomicBool) -> Vec<Vec<u8>> {
     let wire = Wire::open(instance);
     let lease = wire.acquire(0..1).lease;
     let (mut paths, mut seen) = (Paths::new(0), Vec::new());
@@ -74,7 +74,7 @@ fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec
         seen.push(payload);
         if seen.len() == 1 {
             // The server has now allocated everything for the victim, so that later growth is due to the attack.
-            tell_lease.send(lease).expect("somebody steals the lease");
+            began.send(()).expect("an attacker");
         }
         std::thread::sleep(PACE);
     }

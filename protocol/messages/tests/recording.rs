@@ -231,6 +231,16 @@ fn a_hostile_record_is_refused_by_where_it_is() {
     check(&raw_record(2, &[0; 95]), "expected 96 bytes, got 95");
     check(&raw_record(3, &[0; 48]), "expected a server before");
     check(&raw_record(4, b"{}"), "JSON: missing field");
+    // A checksum does not protect a frame from its author.
+    let (_, places) = written();
+    let good = frame(1, (2, 3), [0, 4], &[1; 16]);
+    let mut body = [bytemuck::bytes_of(&good.header), &good.payload[..]].concat();
+    for bit in 0..8 * body.len() {
+        body[bit / 8] ^= 1 << (bit % 8);
+        let (records, _) = read(&[&whole[..places[1]], &raw_record(2, &body)].concat());
+        assert!(records.len() <= 2, "bit {bit}");
+        body[bit / 8] ^= 1 << (bit % 8);
+    }
     for behind in [b"x", &whole[16..]] {
         check_refused(&[&whole, behind].concat(), "nothing after the end");
     }

@@ -1,6 +1,5 @@
 //! Fuzz targets for models and checkpoints.
 
-use super::messages::Seed;
 use emberwatch_acting::beliefs::LEARNED;
 use emberwatch_acting::beliefs::learned::LearnedModel;
 use emberwatch_acting::config::AgentConfig;
@@ -9,12 +8,10 @@ use emberwatch_acting::policy::LearnedDecisions;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
-use emberwatch_learning::checkpoint::{Contents, WrongDigest, decode, encode};
+use emberwatch_learning::checkpoint::{WrongDigest, decode};
 use emberwatch_learning::learners::decisions::{Base, DecisionsLearner, SavedDecisions};
 use emberwatch_learning::learners::filter::fit::FilterFit;
-use emberwatch_learning::learners::network::SavedNetwork;
 use emberwatch_learning::learners::{self, Learner, Worlds};
-use emberwatch_learning::reward::RewardEstimate;
 use emberwatch_network::Device;
 use emberwatch_protocol::model::ModelFile;
 use emberwatch_protocol::{Airspace, Dynamics, Frame, Model, Shape};
@@ -125,40 +122,11 @@ fn config() -> AgentConfig {
     config
 }
 
-/// Returns the checkpoint of an untrained decisions learner with an untrained filter.
-fn decisions() -> Contents {
-    let learner = DecisionsLearner::new(base_of_filter(), None, worlds(), &config());
-    let mut contents = learner.and_then(|learner| learner.contents());
-    let contents = contents.as_mut().expect("no device");
-    contents.settings = "decisions.width = 1".into();
-    contents.clone()
-}
-
 fn base_of_filter() -> Base {
     let fit = FilterFit::new(dimensions(), worlds().shape(), &config());
     let mut learned = Learned::default();
     learned.put(fit.learned());
     Base::new(&LEARNED, None, learned, worlds().shape()).expect("learned")
-}
-
-pub fn checkpoint_seeds() -> Vec<Seed> {
-    let encoded = |kind, contents: Contents| encode(kind, &contents).expect("they serialise");
-    // The large autoencoder claims a size of 30 GiB, but no decoder may allocate so much.
-    [
-        ("filter", "learned_filter", filter(dimensions())),
-        ("autoencoder", "autoencoder", autoencoder(8, 4)),
-        ("autoencoder_large", "autoencoder", autoencoder(4096, 256)),
-        ("decisions", "decisions", decisions()),
-    ]
-    .map(|(name, kind, contents)| (name, encoded(kind, contents)))
-    .into()
-}
-
-/// Returns the checkpoint of a filter learner after some frames.
-fn filter(dimensions: Dimensions) -> Contents {
-    let mut fit = FilterFit::new(dimensions, worlds().shape(), &config());
-    see_frames(&mut fit);
-    fit.contents()
 }
 
 /// Fits a filter to some frames. Learning may fail, because finite numbers can overflow.
@@ -174,22 +142,5 @@ fn see_frames(fit: &mut FilterFit) {
         if fit.learn().is_err() {
             return;
         }
-    }
-}
-
-/// Returns the checkpoint of an autoencoder of this size, without its weights.
-fn autoencoder(side: usize, length: usize) -> Contents {
-    let state = SavedNetwork {
-        shape: Shape::new(side, side).expect("a grid"),
-        n_observations: 3,
-        counters: [0, 0],
-        n_dqn_updates: 0,
-        reward: RewardEstimate::new(3),
-        iterations: 0,
-    };
-    let settings = format!("[autoencoder]\nencoding = {length}\nhidden = {length}\n");
-    Contents {
-        settings,
-        ..Contents::new([], &state)
     }
 }

@@ -1,12 +1,9 @@
 //! Fuzz targets for the messages that clients and observers read.
 
-use bytemuck::{Pod, bytes_of};
-use emberwatch_protocol::agent_belief::{AgentBelief, Intent};
+use bytemuck::Pod;
+use emberwatch_protocol::agent_belief::AgentBelief;
 use emberwatch_protocol::control::{Reply, parse};
-use emberwatch_protocol::message::{
-    AgentHeader, FLAG_TEAM_FRAMES, FrameHeader, RobotResult, Status, StepReply, VERSION,
-    WorldResult,
-};
+use emberwatch_protocol::message::{AgentHeader, FrameHeader, Status, StepReply};
 use emberwatch_protocol::observer::Sample;
 use emberwatch_protocol::path::{path_from_bytes, path_to_bytes};
 use emberwatch_protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
@@ -14,9 +11,6 @@ use emberwatch_protocol::{Coverage, Frame, Shape, UNOBSERVED};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::fmt::Debug;
-
-/// A file of a corpus: its name and bytes.
-pub type Seed = (&'static str, Vec<u8>);
 
 /// Number of observations of the model.
 const N_OBSERVATIONS: usize = 3;
@@ -127,77 +121,4 @@ pub fn survives<T: Serialize + DeserializeOwned + PartialEq + Debug>(bytes: &[u8
     let text = serde_json::to_vec(&value).expect("what was parsed is written");
     assert_eq!(parse::<T>(&text).as_ref(), Ok(&value));
     Some(value)
-}
-
-pub fn step_answer_seeds() -> Vec<Seed> {
-    let header = StepReply {
-        version: VERSION,
-        n_worlds: 1,
-        n_robots: 2,
-        height: 1,
-        width: 3,
-        ..StepReply::default()
-    };
-    let (mut team, mut refusal, mut world) = (header, header, WorldResult::default());
-    team.flags = FLAG_TEAM_FRAMES;
-    (world.step, world.reward, world.late) = (1, 2.0, 2);
-    let results = [bytes_of(&world), bytes_of(&flew(4)), bytes_of(&flew(0))].concat();
-    (refusal.status, refusal.detail) = (Status::NoLease as u32, 1);
-    (refusal.n_worlds, refusal.n_robots) = (0, 0);
-    let answer = |header: &StepReply, frames: &[u8]| [bytes_of(header), &results, frames].concat();
-    vec![
-        ("two_robots", answer(&header, &[0, 255, 2, 255, 255, 255])),
-        ("team_frame", answer(&team, &[0, 255, 2])),
-        ("refusal", bytes_of(&refusal).to_vec()),
-    ]
-}
-
-/// Returns the result of a robot that flew `n_moves` moves.
-fn flew(n_moves: u32) -> RobotResult {
-    RobotResult {
-        reward: 2.0,
-        coverage: u32::from(n_moves > 0),
-        n_moves,
-        ..RobotResult::default()
-    }
-}
-
-pub fn frame_seeds() -> Vec<Seed> {
-    let mut header = FrameHeader {
-        version: VERSION,
-        n_robots: 2,
-        height: 2,
-        width: 3,
-        ..FrameHeader::default()
-    };
-    let unseen = [255; 6];
-    let sample = |header: &FrameHeader, n_moves: [u32; 2], behind: &[u8]| {
-        let robots = n_moves.map(flew);
-        [bytes_of(header), bytemuck::cast_slice(&robots), behind].concat()
-    };
-    let reset = sample(&header, [0, 0], &[unseen, unseen].concat());
-    (header.result.step, header.result.hovered) = (1, 1);
-    let seen = [&unseen[..], &[255, 1, 2, 0, 255, 255], &[3, 3, 1, 0]].concat();
-    let step = sample(&header, [0, 4], &seen);
-    vec![("step", step), ("reset", reset)]
-}
-
-pub fn outlook_seeds() -> Vec<Seed> {
-    let header = AgentHeader {
-        version: VERSION,
-        height: 2,
-        width: 3,
-        n_states: 2,
-        n_robots: 1,
-        ..AgentHeader::default()
-    };
-    let intent = Intent {
-        policy: "beam".into(),
-        states: vec!["normal".into(), "fire".into()],
-        ..Intent::default()
-    };
-    let belief = [0.25f32, 0.75].map(|p| [p; 6]).concat();
-    let belief: Vec<u8> = belief.iter().flat_map(|p| p.to_ne_bytes()).collect();
-    let intent = serde_json::to_vec(&intent).expect("messages serialise");
-    vec![("belief", [bytes_of(&header), &belief, &intent].concat())]
 }

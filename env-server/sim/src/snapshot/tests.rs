@@ -96,6 +96,35 @@ fn every_truncation_and_every_changed_byte_is_detected() {
     assert!(said.starts_with("malformed: "), "{said}");
 }
 
+/// A hostile author can write any byte with a matching header.
+#[test]
+fn a_world_with_any_byte_changed_is_refused_or_flies_and_ends() {
+    let spec = spec();
+    let whole = bytes(&spec.settings, &episodes(&spec.rules));
+    let mut n_restored = 0;
+    for at in HEADER_BYTES..whole.len() {
+        for value in [0, 1, 0x7f, 0xff] {
+            let mut bytes = whole.clone();
+            bytes[at] = value;
+            let checksum = crc32fast::hash(&bytes[HEADER_BYTES..]);
+            bytes[12..16].copy_from_slice(&checksum.to_ne_bytes());
+            let restored = decode(&bytes).and_then(|it| it.restore(&spec));
+            for world in restored.into_iter().flatten() {
+                let SnapshotWorld::Ready(mut episode) = world else {
+                    continue;
+                };
+                n_restored += 1;
+                if !episode.is_over() {
+                    step(&spec.rules, &mut episode, 0);
+                }
+                let k = episode.outcome().step;
+                assert!(episode.recall(k).is_ok() && episode.recall(k + 1).is_err());
+            }
+        }
+    }
+    assert!(n_restored > 1000, "{n_restored} worlds prove little");
+}
+
 macro_rules! changes {
     ($world:ident: $($change:block $words:literal)*) => {
         &[$((|$world| $change, $words)),*]
