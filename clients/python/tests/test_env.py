@@ -11,7 +11,7 @@ import tomllib
 from functools import partial
 from pathlib import Path
 from types import NoneType
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 import gymnasium
 import numpy as np
@@ -38,7 +38,7 @@ from processes import find
 
 import emberwatch
 from emberwatch.envs.parallel import WildfireParallelEnv
-from emberwatch.envs.settings import Settings, WorldArguments
+from emberwatch.envs.settings import KEYWORDS, Settings
 from emberwatch.errors import LeaseLostError, NoServerError
 
 PARTS = ["frame", "robot", "age"]
@@ -82,7 +82,7 @@ def test_help_shows_each_keyword_with_its_default() -> None:
     for kind in (*(getattr(emberwatch, name) for name in names), WildfireParallelEnv):
         words = pydoc.render_doc(kind, renderer=pydoc.plaintext)
         own = {field.name: repr(field.default) for field in dataclasses.fields(Settings)}
-        for keyword in WorldArguments.__annotations__:
+        for keyword in KEYWORDS:
             default = re.escape(own.get(keyword, "None"))
             assert re.search(rf"\b{keyword}: [^=]+ = {default}", words), keyword
         assert "**world" not in words
@@ -94,7 +94,7 @@ def test_each_setting_of_worlds_is_a_keyword_with_a_row_in_the_table() -> None:
         "n_moves" if name == "moves" else name: it
         for name, it in tomllib.loads(file.read_text()).items()
     }
-    kinds = get_type_hints(WorldArguments)
+    kinds = KEYWORDS
     table = f"{emberwatch.WildfireEnv.__doc__}{emberwatch.WildfireVectorEnv.__doc__}"
     own = {field.name for field in dataclasses.fields(Settings)}
     for keyword in kinds.keys() - own:

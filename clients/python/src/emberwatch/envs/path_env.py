@@ -1,6 +1,6 @@
 """`emberwatch/Wildfire-v0`: one step flies one path."""
 
-from typing import Unpack
+from typing import Any
 
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
@@ -9,7 +9,7 @@ from emberwatch.client import wire
 from emberwatch.envs.base import Reward, WorldEnv, check_reward
 from emberwatch.envs.observations import Observations, Parts, has_memory
 from emberwatch.envs.session import Session
-from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
+from emberwatch.envs.settings import Settings, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
 
 
@@ -155,7 +155,7 @@ class WildfireEnv(WorldEnv):
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
         kind: str = "known",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
         session = Session(Settings.of(WildfireEnv, world))
@@ -191,7 +191,7 @@ class WildfireVectorEnv(WorldVectorEnv):
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
         kind: str = "known",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
         pays = check_reward(reward)

@@ -108,7 +108,7 @@ class Session:
         self.n_rows: Final = len(self._robots)
         self.n_worlds: Final = max(1, self.n_rows // self.spec.n_robots)
         self._worlds: Final = range(settings.world, settings.world + self.n_worlds)
-        if settings.truth and settings.instance and self.n_worlds > wire.TRUTH_BUFFER:
+        if settings.reads_truth and settings.instance and self.n_worlds > wire.TRUTH_BUFFER:
             raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", self.n_worlds)
         warn_without_rewards(self.spec)
 
@@ -308,11 +308,11 @@ class Session:
             if settings.instance is None:
                 assert self._own is not None
                 self._client = client = Client.embedded(self._own, seed)
-                self._truth = Present(client.truths) if settings.truth else None
+                self._truth = Present(client.truths) if settings.reads_truth else None
             else:
                 self._client = client = self._connect(settings.instance)
                 self._check_unchanged(client)
-                if settings.truth:
+                if settings.reads_truth:
                     self._truth = Newest(client.instance, self._worlds)
             self._lease = self._acquire(client, settings.takeover)  # sets `is_open`
             self._state = State.MOVED

@@ -1,8 +1,6 @@
 """The state of an environment in memory."""
 
-import pickle
 from dataclasses import dataclass, field
-from typing import Any, Self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,11 +16,3 @@ class EnvState:
     """The worlds and robots, in the format of a snapshot file. They contain the hidden states."""
     memory: bytes = field(repr=False)
     """The rest: beliefs, memory of frames, moves of incomplete paths, generators."""
-
-    @classmethod
-    def of(cls, form: str, worlds: bytes, memory: dict[str, Any]) -> Self:
-        return cls(form, worlds, pickle.dumps(memory))
-
-    def copy_of_memory(self) -> dict[str, Any]:
-        """Returns a new copy of the memory."""
-        return pickle.loads(self.memory)

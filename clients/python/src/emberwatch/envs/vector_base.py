@@ -19,20 +19,14 @@ from numpy.typing import NDArray
 from emberwatch._native import columns
 from emberwatch.client.wire import RESULT_DTYPE, StepAnswer
 from emberwatch.common.arguments import as_array, as_integer, as_moves, as_seed
-from emberwatch.envs.base import (
-    NOTHING_TO_DRAW,
-    WorldEnv,
-    as_options,
-    wants_to_resume,
-)
+from emberwatch.envs.base import as_options, wants_to_resume
 from emberwatch.envs.observations import Observations, of_row
 from emberwatch.envs.owner import SessionOwner
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, draw_seed
-from emberwatch.envs.view import View
+from emberwatch.envs.view import METADATA
 from emberwatch.errors import invalid, repr_of
-from emberwatch.model.moves import fly
 
 
 class Columns(NamedTuple):
@@ -54,6 +48,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 ):
     """A vector environment of many robots, stepped together."""
 
+    _KEPT = ("_elapsed", "_over", "_has_ended", "_generators", "_paths")
+
     # True until `__init__` ends, because Gymnasium 1.2 also closes an object whose `__init__`
     # failed.
     closed = True
@@ -68,7 +64,6 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
     ) -> None:
-        """`pays` is the kind of reward, an index in `base.REWARDS`."""
         if max_episode_steps == -1:  # means no limit in `gymnasium.make`
             max_episode_steps = None
         if max_episode_steps is not None:
@@ -76,25 +71,19 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             if max_episode_steps is None or max_episode_steps < 1:
                 raise invalid("max_episode_steps", "at least 1 or None", repr_of(given))
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self._session, self._spec = session, session.spec
-        spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
-        self._observations = observations
-        self._view = View(mode, spec)
-        self._max_steps = max_episode_steps
-        self._reveals = session.settings.reveals
-        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
-        self.num_envs = num_envs
-        self.render_mode = mode
+        self._attach(session, observations, pays)
+        #: Number of steps after which episodes are truncated; None: never.
+        self.max_episode_steps = max_episode_steps
+        self.metadata = {**METADATA, "autoreset_mode": self.autoreset_mode}
+        self.num_envs = num_envs = session.n_rows
         self.single_observation_space = observations.space
         self.observation_space = batch_space(observations.space, num_envs)
         self.single_action_space = action_space
         self.action_space = batch_space(action_space, num_envs)
         #: The generator of each world's seeds, with its own seed; None before the first reset.
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * session.n_worlds
-        self._pays = pays
-        self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
+        self._frames = np.zeros((num_envs, self._spec.height, self._spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
-        #: The results as columns.
         self._columns = self._columns_of(self._results)
         self._every = np.ones(num_envs, np.bool_)
         self._none = np.zeros(num_envs, np.bool_)
@@ -102,8 +91,6 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._over, self._has_ended = self._none, False
         #: Mask of the robots that completed a path in the current step; None if no robot did.
         self._exchanged: NDArray[np.bool_] | None = None
-        self._truths: NDArray[np.uint8] | None = None
-        self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
 
     def reset(
@@ -182,25 +169,11 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns a picture for each robot, as `WildfireEnv.render` draws it."""
-        if self.render_mode is None or not self.is_open:
-            gymnasium.logger.warn(NOTHING_TO_DRAW)
+        if not self.can_draw():
             return None
         if self.render_mode == "human":
             return (None,) * self.num_envs
         return tuple(self.draw(slice(row, row + 1)) for row in range(self.num_envs))
-
-    def draw(self, rows: slice) -> Any:
-        """Draws some robots of one world, and their combined frame."""
-        row: int = rows.start
-        frame, cells = self.seen(rows)
-        robots = [(at[0], at[1]) for at in cells.tolist()]
-        paths = [path for path in map(self._path, range(self.num_envs)[rows]) if path is not None]
-        truth = self._truths[row] if self._truths is not None and self._reveals else None
-        return self._view.draw(frame, robots, paths, truth)
-
-    def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Returns the combined frame and the cells of some robots of one world, as new arrays."""
-        return self._frames[rows].min(axis=0), self._robots()[rows]
 
     @property
     def results(self) -> NDArray[np.void]:
@@ -217,10 +190,6 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         For reports, not for learners. Do not write to the array.
         """
         return self._truths
-
-    def end_after(self, max_episode_steps: int | None) -> None:
-        """Replaces the number of steps after which episodes are truncated; None: never."""
-        self._max_steps = max_episode_steps
 
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()
@@ -241,33 +210,15 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         """Is called after episodes in the rows `begun` have begun or have been resumed."""
 
     def _robots(self) -> NDArray[np.int64]:
-        """Returns row and column of each robot as a new array."""
         return self._columns.cells.copy()
 
-    def _path(self, row: int) -> NDArray[np.intp] | None:
-        """Returns the cells of a robot's last path, which are kept only with a render mode."""
-        return self._paths[row]
-
     def _form(self) -> str:
-        mode, steps = self.autoreset_mode.value, self._max_steps
+        mode, steps = self.autoreset_mode.value, self.max_episode_steps
         return f"{super()._form()}, max_episode_steps={steps}, autoreset_mode={mode}"
 
-    def _memory(self) -> dict[str, Any]:
-        return {
-            "elapsed": self._elapsed,
-            "over": self._over,
-            "generators": self._generators,
-            "paths": self._paths,
-            "observations": self._observations.memory(),
-        }
-
-    def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+    def _restore(self, answer: StepAnswer) -> None:
         self._take(answer)
-        self._elapsed, self._over = memory["elapsed"], memory["over"]
-        self._has_ended = bool(self._over.any())
-        self._generators, self._paths = memory["generators"], memory["paths"]
         self._begin(self._every)
-        self._observations.restore(memory["observations"], self._results)
 
     def _exchange(self, paths: NDArray[Any], moved: NDArray[np.bool_]) -> None:
         """Flies complete paths in the rows `moved`, with one message for each run of rows."""
@@ -281,11 +232,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         if self._observations.has_memory:
             self._observations.update(moved, self._results, self._frames)
         if self.render_mode is not None:
-            flown = as_moves(paths, self.num_envs, self._spec.n_moves)
-            for row in np.flatnonzero(moved).tolist():
-                robot = self._results["robot"][row]
-                start = int(robot["start_row"]), int(robot["start_col"])
-                self._paths[row] = fly(start, flown[row], self._spec)
+            self._keep_paths(moved, self._results, paths)
 
     def _exchange_run(self, paths: NDArray[Any], run: range) -> None:
         chosen = slice(run.start, run.stop)
@@ -341,7 +288,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _take(self, answer: StepAnswer) -> None:
         self._frames, self._results = answer.frames, answer.results
         self._columns = self._columns_of(self._results)
-        if self._session.settings.truth:
+        if self._reads_truth:
             self._truths = self._session.truth(answer)
 
     def _columns_of(self, results: NDArray[np.void]) -> Columns:
@@ -355,8 +302,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         if self._exchanged is not None and self._columns.is_over:
             terminations |= self._exchanged & self._columns.terminated
             truncations |= self._exchanged & self._columns.truncated
-        if self._max_steps is not None:
-            truncations |= flown & (self._elapsed >= self._max_steps)
+        if self.max_episode_steps is not None:
+            truncations |= flown & (self._elapsed >= self.max_episode_steps)
         over = terminations | truncations
         has_ended = np.count_nonzero(over) > 0
         infos: dict[str, Any] = {}

@@ -11,21 +11,20 @@ from emberwatch.errors import invalid, repr_of
 from emberwatch.render import Palette, Picture, ansi, rgb_array
 from emberwatch.render.screen import Screen
 
-#: The render modes of all environments.
-RENDER_MODES: Final = ("human", "rgb_array", "ansi")
-
-#: Pictures per second in a film, and maximum number per second in a window.
-RENDER_FPS: Final = 10
+#: The render modes of all environments; pictures per second in a film, and at most in a window.
+METADATA: Final[dict[str, Any]] = {
+    "render_modes": ["human", "rgb_array", "ansi"],
+    "render_fps": 10,
+}
 
 
 class View:
     """A painter of one world: its frame, robots, paths, and hidden states if they are known."""
 
     def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise invalid(
-                "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr_of(render_mode)
-            )
+        modes: list[str] = METADATA["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise invalid("render_mode", f"None or one of {', '.join(modes)}", repr_of(render_mode))
         self.mode: Final = render_mode
         self._airspace: Final = spec.airspace
         self._palette: Final = Palette.of(spec.described or spec.n_observations)
@@ -52,7 +51,7 @@ class View:
         if self.mode == "ansi":
             return ansi(picture)
         if self._screen is None:
-            self._screen = Screen(fps=RENDER_FPS)
+            self._screen = Screen(fps=METADATA["render_fps"])
         self._screen.show(picture)
         return None
 
