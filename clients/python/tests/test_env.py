@@ -336,9 +336,9 @@ def test_a_new_server_with_other_worlds_is_refused() -> None:
         env.reset()
     with impatient(env), pytest.raises(NoServerError):
         env.reset()
-    with serving(instance=instance, width=6), refuses("width=6"):
+    with serving(instance=instance, width=6), refuses("another width"):
         env.reset()
-    with serving(instance=instance, model="wildfire"), refuses("model"):
+    with serving(instance=instance, model="wildfire"), refuses("another model"):
         env.reset()
 
 

@@ -158,7 +158,7 @@ def test_a_team_is_drawn_as_a_whole() -> None:
 def test_invalid_team_keywords_are_named() -> None:
     rows: list[tuple[dict[str, Any], str]] = [
         ({"action": "fly"}, "action: expected 'move' or 'path', got 'fly'"),
-        ({"robot": 1}, "robot: expected"),
+        ({"robot": 1}, "robot: applies only"),
         ({"reward": "all"}, "reward: expected one of 'share', 'team', 'marginal', 'move'"),
         ({"action": "path", "reward": "move"}, "reward: expected one of 'share', 'team', 'marg"),
         ({"observation": "age of fire"}, "observation: expected one or several of"),
@@ -262,7 +262,7 @@ def test_keywords_that_do_not_fit_a_servers_team_are_named() -> None:
             (make, {"robot": -1}, "robot: expected 0 to 2, got -1"),
             (make, {"robot": 0, "robots": 2}, "robots: expected the server's 3"),
             (make, {"robot": 0, "world": 1}, "world: expected worlds within 0 to 0, got 1 to 1"),
-            (partial(make_vec, 3), {"robot": 0}, "robot: expected None, as a vector"),
+            (partial(make_vec, 3), {"robot": 0}, "robot: expected None, as all robots"),
             (partial(make, OBJECTIVE), {"robot": 0}, of_one),
             (partial(make_vec, 3, OBJECTIVE), {}, of_one),
         ]

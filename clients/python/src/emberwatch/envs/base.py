@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from emberwatch.client.wire import UNOBSERVED, StepAnswer
 from emberwatch.common.arguments import as_seed
 from emberwatch.envs.observations import Observations
-from emberwatch.envs.owner import SessionOwner
+from emberwatch.envs.owner import METADATA, SessionOwner
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session, not_reset
 from emberwatch.envs.settings import draw_seed
-from emberwatch.envs.view import METADATA
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
 
 #: Kinds of reward, in the order of the native module's `pays`.
@@ -98,8 +97,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return self.draw(slice(0, 1))
 
     def close(self) -> None:
-        self._session.close()
-        self._view.close()
+        self._close()
         self._answer = self._teams = None  # answers cannot be copied or pickled
 
     def past_frames(self) -> Iterator[NDArray[np.uint8]]:

@@ -17,7 +17,7 @@ from emberwatch.envs.owner import SessionOwner
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session, not_reset
 from emberwatch.envs.settings import Settings, shows_keywords
-from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
+from emberwatch.envs.vector_base import WorldVectorEnv
 from emberwatch.model.moves import fly
 
 MovesReward: TypeAlias = Literal[Reward, "move"]
@@ -225,7 +225,7 @@ class WildfireMovesVectorEnv(MovesOwner, WorldVectorEnv):
         """See the class."""
         pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesVectorEnv, world, needs_truth=reward == "move")
-        session = vector_session(settings, num_envs)
+        session = Session(settings, num_envs)
         super().__init__(
             session,
             Observations(observation, session, kind, window=window, pays=reward == "move"),

@@ -12,7 +12,7 @@ from emberwatch.envs.base import WorldEnv
 from emberwatch.envs.plans import FirstBelief, Plans, PlansOwner
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, shows_keywords
-from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
+from emberwatch.envs.vector_base import WorldVectorEnv
 
 
 class WildfireObjectiveEnv(PlansOwner, WorldEnv):
@@ -122,7 +122,7 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
         **world: Any,
     ) -> None:
         """See the class."""
-        session = vector_session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
+        session = Session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
         self._plans = plans = Plans(session, estimator, checkpoint, prior)
         super().__init__(
             session,

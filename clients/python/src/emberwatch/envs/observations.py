@@ -13,7 +13,6 @@ from emberwatch.belief import Belief, kinds, known
 from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
 from emberwatch.common.arguments import as_integer
-from emberwatch.envs.flights import flights_of
 from emberwatch.envs.last_seen import LastSeen
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
@@ -98,8 +97,14 @@ class Observations:
         #: The paths of robots that fly move by move.
         self.flights: Flights | None = None
         if window is not None:
+            if pays and spec.described is None:
+                needs = "reward='move': expected a server that reveals its model"
+                raise InvalidArgumentError(needs)
+            # Each cell pays the reward of its hidden state when the path first visits it.
+            reward = spec.described.reward.tolist() if pays and spec.described else None
             windows = [(window, channels[name]) for name in self._windows]
-            self.flights = flights_of(spec, n_rows, windows, pays=pays)
+            size = n_rows, spec.height, spec.width, spec.n_moves
+            self.flights = Flights(*size, reward, spec.airspace, windows)
         #: Whether observations depend on frames before the last one.
         self.has_memory = has_memory(names)
         self._image = np.empty(0, np.uint8)

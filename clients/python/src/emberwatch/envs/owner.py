@@ -3,7 +3,7 @@
 import pickle
 from contextlib import AbstractContextManager
 from copy import copy
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import gymnasium
 import numpy as np
@@ -19,10 +19,17 @@ from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
 from emberwatch.envs.state import EnvState
-from emberwatch.envs.view import View
 from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
 from emberwatch.model.moves import fly
+from emberwatch.render import Palette, Picture, ansi, rgb_array
+from emberwatch.render.screen import Screen
+
+#: Pictures per second in a film, and at most in a window.
+FPS: Final = 10
+
+RENDER_MODES: Final = ("human", "rgb_array", "ansi")
+METADATA: Final[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": FPS}
 
 
 class SessionOwner:
@@ -43,8 +50,11 @@ class SessionOwner:
         self._observations, self._pays = observations, pays
         self._reveals = session.settings.truth
         self._reads_truth = session.settings.reads_truth
-        self.render_mode = session.settings.render_mode
-        self._view = View(self.render_mode, session.spec)
+        self.render_mode = mode = session.settings.render_mode
+        if mode is not None and mode not in RENDER_MODES:
+            raise invalid("render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr_of(mode))
+        self._palette = Palette.of(session.spec.described or session.spec.n_observations)
+        self._screen: Screen | None = None
         #: The cells of each robot's last path; None without a render mode.
         self._paths: list[NDArray[np.intp] | None] = [None] * session.n_rows
 
@@ -152,12 +162,28 @@ class SessionOwner:
             self._session.finish()
 
     def draw(self, rows: slice) -> Any:
-        """Draws some robots of one world, and their combined frame."""
+        """Returns a picture of some robots of one world, or shows it, in mode ``"human"``."""
         frame, cells = self.seen(rows)
-        robots = [(row, col) for row, col in cells.tolist()]
         paths = [self._path(row) for row in range(len(self._paths))[rows]]
-        truth = self._truths[rows.start] if self._reveals and self._truths is not None else None
-        return self._view.draw(frame, robots, [path for path in paths if path is not None], truth)
+        picture = Picture(
+            frame=frame,
+            palette=self._palette,
+            robots=[(row, col) for row, col in cells.tolist()],
+            paths=[path for path in paths if path is not None],
+            truth=self._truths[rows.start] if self._reveals and self._truths is not None else None,
+            airspace=self._spec.airspace,
+        )
+        if self.render_mode != "human":
+            return rgb_array(picture) if self.render_mode == "rgb_array" else ansi(picture)
+        self._screen = self._screen or Screen(fps=FPS)
+        self._screen.show(picture)
+        return None
+
+    def _close(self) -> None:
+        self._session.close()
+        if self._screen is not None:
+            self._screen.close()
+            self._screen = None
 
     def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
         """Returns the combined frame and the cells of some robots of one world, as new arrays."""

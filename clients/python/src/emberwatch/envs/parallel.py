@@ -17,11 +17,10 @@ from emberwatch.common.arguments import as_array
 from emberwatch.envs.base import as_options
 from emberwatch.envs.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.envs.observations import MovesParts, names_of, of_row
-from emberwatch.envs.owner import state_of
+from emberwatch.envs.owner import METADATA, state_of
 from emberwatch.envs.path_env import WildfireVectorEnv
 from emberwatch.envs.settings import shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv, info_of
-from emberwatch.envs.view import METADATA
 from emberwatch.errors import invalid, repr_of
 
 _ENVIRONMENTS: Final = {"move": WildfireMovesVectorEnv, "path": WildfireVectorEnv}

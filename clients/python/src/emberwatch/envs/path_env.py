@@ -1,5 +1,6 @@
 """`emberwatch/Wildfire-v0`: one step flies one path."""
 
+from dataclasses import replace
 from typing import Any
 
 from gymnasium import spaces
@@ -10,7 +11,7 @@ from emberwatch.envs.base import Reward, WorldEnv, check_reward
 from emberwatch.envs.observations import Observations, Parts, has_memory
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import Settings, shows_keywords
-from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
+from emberwatch.envs.vector_base import WorldVectorEnv
 
 
 class WildfireEnv(WorldEnv):
@@ -196,7 +197,9 @@ class WildfireVectorEnv(WorldVectorEnv):
         """See the class."""
         pays = check_reward(reward)
         settings = Settings.of(WildfireVectorEnv, world)
-        session = vector_session(settings, num_envs, rebuilds_memory=has_memory(observation))
+        if settings.instance is None and not has_memory(observation):
+            settings = replace(settings, history=1)  # a reset with `resume` needs no earlier frames
+        session = Session(settings, num_envs)
         super().__init__(
             session,
             Observations(observation, session, kind=kind),

@@ -7,7 +7,7 @@ and used in a forked child, as in Gymnasium's `AsyncVectorEnv`.
 import threading
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields
 from enum import Enum
 from typing import Final
 
@@ -28,7 +28,7 @@ from emberwatch.envs.advice import (
     warn_without_rewards,
 )
 from emberwatch.envs.fork_lock import ForkLock
-from emberwatch.envs.settings import Settings, WorldSpec, own_spec, running_spec
+from emberwatch.envs.settings import Settings, own_spec, running_spec
 from emberwatch.errors import (
     EmberwatchError,
     LeaseLostError,
@@ -430,15 +430,13 @@ class Session:
         """Refuses a new server of the instance if its worlds differ from the first server's."""
         spec, _ = running_spec(self.settings, self._asked_rows, client.info)
         if spec != self.spec:
+            names = [each.name for each in fields(spec) if each.compare]
+            others = [name for name in names if getattr(spec, name) != getattr(self.spec, name)]
             raise invalid(
                 f"instance {client.instance!r}",
-                f"the server as it was when the environment was made, {_without_model(self.spec)}",
-                f"{_without_model(spec)} or another model: make the environment again",
+                "the server as it was when the environment was made",
+                f"another {', '.join(others)}: make the environment again",
             )
-
-
-def _without_model(spec: WorldSpec) -> WorldSpec:
-    return replace(spec, model=None, description=None)
 
 
 def not_reset() -> EmberwatchError:

@@ -5,7 +5,6 @@ of a world begin and end their episodes together.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -21,11 +20,10 @@ from emberwatch.client.wire import RESULT_DTYPE, StepAnswer
 from emberwatch.common.arguments import as_array, as_integer, as_moves, as_seed
 from emberwatch.envs.base import as_options, wants_to_resume
 from emberwatch.envs.observations import Observations, of_row
-from emberwatch.envs.owner import SessionOwner
+from emberwatch.envs.owner import METADATA, SessionOwner
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
-from emberwatch.envs.settings import Settings, draw_seed
-from emberwatch.envs.view import METADATA
+from emberwatch.envs.settings import draw_seed
 from emberwatch.errors import invalid, repr_of
 
 
@@ -64,6 +62,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
     ) -> None:
+        if session.settings.robot is not None:
+            raise invalid("robot", "None, as vectors fly all robots", session.settings.robot)
         if max_episode_steps == -1:  # means no limit in `gymnasium.make`
             max_episode_steps = None
         if max_episode_steps is not None:
@@ -113,17 +113,13 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         seeds = self._check_seeds(seed)
         resumes = wants_to_resume(rest, seed)
         with self._session.turn:
-            if not mask.all() and not self.is_open:
+            was_ready = self.is_open and not self._session.is_unfinished
+            if not mask.all() and not was_ready:
                 raise gymnasium.error.ResetNeeded(
-                    "reset_mask: expected all worlds in the first reset, got some"
-                )
-            if not mask.all() and self._session.is_unfinished:
-                raise gymnasium.error.ResetNeeded(
-                    "reset_mask: expected all worlds, as an earlier step or reset did not finish, "
-                    "got some"
+                    "reset_mask: expected all worlds in the first reset, or after a step or reset "
+                    "that did not finish, got some"
                 )
             self.closed = False
-            was_ready = self.is_open and not self._session.is_unfinished
             self._session.begin_reset()
             chosen = np.flatnonzero(mask).tolist()
             if resumes:
@@ -192,8 +188,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._truths
 
     def close_extras(self, **kwargs: Any) -> None:
-        self._session.close()
-        self._view.close()
+        self._close()
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[Any]:
         """Returns checked actions. If all robots fly, the session checks their paths."""
@@ -399,21 +394,6 @@ def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
         name: value.item() if isinstance(value, np.generic) else value
         for name, value in shown.items()
     }
-
-
-def vector_session(
-    settings: Settings, num_envs: int | None, *, rebuilds_memory: bool = True
-) -> Session:
-    """Makes a session of all robots of some worlds.
-
-    `rebuilds_memory`: whether a reset with `resume` needs earlier frames. Otherwise, worlds in this
-    process keep only the last frame.
-    """
-    if settings.robot is not None:
-        raise invalid("robot", "None, as a vector environment flies all robots", settings.robot)
-    if settings.instance is None and not rebuilds_memory:
-        settings = replace(settings, history=1)
-    return Session(settings, num_envs)
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[range]:
