@@ -107,16 +107,6 @@ def test_it_passes_the_checker_and_can_keep_observations() -> None:
             assert (observation["frame"][:, :, 0] == env.unwrapped.frame).all()
 
 
-def test_images_are_beliefs_as_bytes_channels_last() -> None:
-    envs = [BeliefObservation(Stub(), dtype=dtype) for dtype in ("uint8", "float32")]
-    for env in envs:
-        env.reset(seed=0)
-    image, planes = (env.step(None)[0] for env in envs)
-    assert image.shape == (*SHAPE, 3) and image.dtype == np.uint8
-    assert np.abs(image.transpose(2, 0, 1) / 255 - planes).max() <= 0.5 / 255 + 1e-6
-    assert image.max() > 200
-
-
 def test_a_spec_makes_the_same_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stub, prior = gymnasium.make("test/Stub-v0"), uniform_prior(WILDFIRE, **GRID)
     env = BeliefObservation(stub, keep=True, dtype="uint8", prior=prior, model=WILDFIRE)

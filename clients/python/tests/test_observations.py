@@ -28,20 +28,6 @@ from emberwatch.wrappers import BeliefObservation
 SMALL: dict[str, Any] = {"height": 12, "width": 12, "n_moves": 6, "model": "wildfire-small"}
 
 
-def test_an_image_has_one_channel_per_value() -> None:
-    env = make(observation=("frame", "image"))
-    env.reset(seed=3)
-    shown = set[int]()
-    for action in actions(env, 20):
-        frame, image = env.step(action)[0].values()
-        assert image.shape == (7, 5, 4) and set(image.ravel()) == {0, 255}
-        assert (image.sum(axis=2, dtype=int) == 255).all()
-        value = image.argmax(axis=2)
-        assert np.array_equal(np.where(value == 3, 255, value), frame[:, :, 0])
-        shown |= set(value.ravel().tolist())
-    assert shown == {0, 1, 2, 3}
-
-
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
 def test_the_belief_part_is_the_filters_prediction(name: str) -> None:
     env, filtered = make(name, observation="belief"), BeliefObservation(make(name), kind="known")
@@ -79,32 +65,11 @@ def test_a_window_shows_the_belief_around_the_robot() -> None:
     assert len({tuple(seen["robot"]) for seen in steps}) > 3
 
 
-def test_a_window_shows_the_last_observations_nearby() -> None:
-    with serving(reveal_model=False, model=LIVELY) as instance:
+def test_a_belief_needs_a_revealed_model() -> None:
+    with serving(reveal_model=False) as instance:
         for part in ("belief", "local"):
             with refuses("observation: expected a server that reveals its mo"):
                 make(MOVES, instance=instance, observation=part)
-        keywords = {"instance": instance, "window": 5}
-        env = make(MOVES, **keywords, observation=("recent", "frame", "visited", "robot", "move"))
-        margin = ((2, 2), (2, 2))
-        for seed, n_moves in ((5, 300), (6, 10)):  # a reset forgets
-            seen, _ = env.reset(seed=seed)
-            expected = np.zeros((*seen["visited"].shape[:2], 3))
-            for action in actions(env, n_moves):
-                row, col = seen["robot"]
-                window = (slice(row, row + 5), slice(col, col + 5))
-                unvisited = seen["visited"] == 0
-                shown = np.rint(255 * expected) * unvisited
-                shown = np.pad(shown, (*margin, (0, 0)))[window]
-                assert np.abs(seen["recent"][..., :3] - shown).max() <= 1
-                assert np.array_equal(
-                    seen["recent"][..., 3], np.pad(seen["visited"][..., 0], margin)[window]
-                )
-                seen = env.step(action)[0]
-                if seen["move"] == 0:  # a path is complete
-                    expected *= 0.5 ** (1 / 16)
-                    expected[seen["frame"][..., 0] != 255] = 0
-                    expected[seen["frame"] == np.arange(3)] = 1
 
 
 #: Parts that remember frames, and parts about a path.
