@@ -55,7 +55,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode, or with `robot` joins the current episode of the shared world.
+        """Begins an episode, or joins the current one.
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
@@ -101,10 +101,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._answer = self._teams = None  # answers cannot be copied or pickled
 
     def past_frames(self) -> Iterator[NDArray[np.uint8]]:
-        """Yields the robot's frames before the current step, `(H, W)`, from the first that is kept.
-
-        Warns once if frames from the beginning of the episode are no longer kept.
-        """
+        """Yields the robot's earlier frames of the episode, `(H, W)`; warns if some are missing."""
         if self._answer is None:
             raise not_reset()
         step = int(self._answer.worlds["step"][0])
@@ -134,7 +131,6 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._take(answer)
 
     def _fly(self, path: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Flies a path, and returns the outcome of the step."""
         answer = self._session.step(path)
         if self._robot is not None:
             self._n_missed = self._session.n_skipped + (int(answer.robots["n_moves"][0]) == 0)
@@ -151,7 +147,6 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         return observation, reward, terminated, truncated, info
 
     def _take(self, answer: StepAnswer) -> None:
-        """Stores the results of the current step."""
         self._answer, self._frames = answer, answer.frames
         self._numbers = answer.numbers(self._pays)
         if self._reads_truth:
@@ -160,7 +155,6 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
             self._teams = self._session.teams(answer)
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
-        """Returns the observation and the info."""
         frames, info = self._frames, self._info()
         if self.render_mode is not None:
             frames = frames.copy()  # the learner may write to it, and pictures show the original
@@ -205,10 +199,10 @@ def as_options(options: object) -> dict[str, Any]:
 
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
     """Returns whether a reset continues the current episode, from the option `resume`."""
-    for key in as_options(options):
-        if key != "resume":
-            raise invalid("options", "'resume'", repr_of(key))
-    resume = as_options(options).get("resume", False)
+    given = as_options(options)
+    resume = given.pop("resume", False)
+    if given:
+        raise invalid("options", "'resume'", repr_of(next(iter(given))))
     if not isinstance(resume, bool):
         raise invalid("options", "resume True or False", repr_of(resume))
     if resume and seed is not None:

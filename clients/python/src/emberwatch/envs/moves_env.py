@@ -49,10 +49,8 @@ class MovesOwner(SessionOwner):
 class WildfireMovesEnv(MovesOwner, WorldEnv):
     """The world of `WildfireEnv`, flown move by move.
 
-    ## Description
-
-    Like `WildfireEnv`, but one step is one move of the robot. After T moves the path is complete.
-    Then the world moves once, and the visited cells are observed and rewarded.
+    One step is one move of the robot. After T moves the path is complete. Then the world moves
+    once, and the visited cells are observed and rewarded.
 
     ## Action Space
 
@@ -71,46 +69,38 @@ class WildfireMovesEnv(MovesOwner, WorldEnv):
 
     | part | space | meaning |
     |---|---|---|
-    | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells that this path has visited |
+    | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in cells that this path has visited |
     | `move` | `Discrete(T)` | number of moves made on this path |
     | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
     | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | the last observations around the robot |
     | `action_mask` | `Box(0, 1, (4,), int8)` | 1 for each move that leads to another cell |
 
-    `local` has five channels, whose values are multiplied by 255:
-
-    1. The probability of the state that pays most.
-    2. The entropy of the belief divided by log S. Channels 1 and 2 are 0 in the cells that this
-       path has visited.
-    3. 1 in the cells that this path has visited.
-    4. 1 off the grid and in no-fly cells.
-    5. The share of the path's moves that remain, the same in all cells.
+    `local` has five channels, whose values are multiplied by 255: the probability of the state that
+    pays most; the entropy of the belief divided by log S; 1 in the cells that this path has
+    visited; 1 off the grid and in no-fly cells; the share of the path's moves that remain. The
+    first two are 0 in visited cells.
 
     `recent` needs no model. It has one channel for each of the O observed values. The channel of a
     cell's last observed value is 255 if the last frame observed it, and halves every 16 steps; the
-    cell's other channels are 0. In cells that this path has visited, all O channels are 0. The last
-    three channels are channels 3 to 5 of `local`.
+    cell's other channels are 0, and all O in visited cells. The last three channels are those of
+    `local`.
 
     ## Rewards
 
-    With `reward="share"` (the default), `"team"` or `"marginal"`, the last move of a path gets the
-    path's reward, and all other moves get 0. Cells pay by their state after the world has moved, so
-    the reward is known only after the last move. These three rewards differ only in worlds of
-    several robots, as in `WildfireEnv`.
+    With `reward="share"` (the default), `"team"` or `"marginal"`, as in `WildfireEnv`, the last move
+    of a path gets the path's reward, and all other moves get 0, as cells pay by their state after
+    the world has moved.
 
     With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
     the world moves. The last move's reward also includes a correction, so that the rewards of a
-    path sum to the robot's share of the path's true reward, as with `"share"`. The correction is
-    small for a lone robot, as one step changes few cells. But `"move"` reveals more about the
-    hidden state than `"share"` does, and earlier, so results with the two rewards are not
-    comparable. `"move"` needs the hidden states: with `instance`, the server must publish them.
+    path sum to the robot's share, as with `"share"`. But `"move"` reveals more about the hidden
+    state, and earlier, so results with the two rewards are not comparable. With `instance`, the
+    server must publish the hidden states.
 
     ## Episode End
 
-    Never `terminated`. `truncated` after `max_episode_steps` moves (default 64,000, which is 1,000
-    paths of 64 moves, or the length of the task whose id it is; pass another number to
-    `gymnasium.make`, as for paths of another length), or after the number of paths set
-    by the task or by the running server's `--max-steps`.
+    As in `WildfireEnv`, but `max_episode_steps` counts moves (default 64,000, which is 1,000 paths of
+    64 moves; pass another number for paths of another length).
 
     ## Starting State, Information
 

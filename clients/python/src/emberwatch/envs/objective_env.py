@@ -18,11 +18,9 @@ from emberwatch.envs.vector_base import WorldVectorEnv
 class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     """The paper's high-level decision: an action chooses the objective of the robot's next path.
 
-    ## Description
-
-    The world is the same as in `WildfireEnv`. The environment keeps a belief about the world, plans
-    a path for each of eight objectives, and describes each planned path by features. The learner,
-    in the role of the paper's deep Q-network (section III.E), chooses which path is flown.
+    The environment keeps a belief about the world of `WildfireEnv`, plans a path for each of eight
+    objectives, and describes each planned path by features. The learner, in the role of the paper's
+    deep Q-network (section III.E), chooses which path is flown.
 
     ## Action Space
 
@@ -42,8 +40,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     As in `WildfireEnv`. The first belief is the one that `prior` names, or the learned one. With
     ``reset(options={"resume": True})``, it is the belief that the last agent left for the world's
-    current step. If no agent left a belief, it is computed from the frames of this episode that the
-    server keeps.
+    current step, or is computed from the frames of this episode that the server keeps.
 
     ## Rewards, Episode End, Information
 

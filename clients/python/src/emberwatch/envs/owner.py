@@ -80,22 +80,13 @@ class SessionOwner:
         return self._session.spec
 
     @property
-    def n_moves(self) -> int:
-        """Number of moves in a path, T."""
-        return self._session.spec.n_moves
-
-    @property
     def burn_in(self) -> int:
         """Number of steps that the worlds are simulated before k = 0."""
         return self._session.spec.burn_in
 
     @property
     def instance(self) -> str:
-        """The instance name of the server that the environment is attached to, after a reset.
-
-        Raises:
-            InvalidArgumentError: If the worlds are in this process, without `instance`.
-        """
+        """The instance name of the environment's server, after a reset; refused without one."""
         return self._session.instance
 
     @property

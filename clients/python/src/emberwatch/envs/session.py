@@ -22,7 +22,6 @@ from emberwatch.client.replies import LeftBelief
 from emberwatch.client.wire import StepAnswer, WorldResult
 from emberwatch.envs.advice import (
     about_barren_worlds,
-    about_forgotten_steps,
     warn,
     warn_of_test_worlds,
     warn_without_rewards,
@@ -72,13 +71,11 @@ _UNFINISHED: Final = frozenset((State.BEGUN, State.MOVED, State.TORN, State.TIME
 
 
 class Session:
-    """Consecutive robots under a lease, one row for each. The first reset opens the session.
+    """Consecutive robots under a lease, one row for each: all of some worlds, or one of a world.
 
-    A session flies all robots of its worlds, or one robot of a world that other clients fly in. An
-    environment holds the lock `turn` during each step and reset, as threads may share the
-    environment. It first calls `begin_step` or `begin_reset`, and at the end `finish`. Ctrl-C or a
-    signal handler may interrupt it in between. Then the state stays unfinished, and steps are
-    refused.
+    An environment holds the lock `turn` during each step and reset, as threads may share it. It
+    first calls `begin_step` or `begin_reset`, and at the end `finish`. Ctrl-C or a signal handler
+    may interrupt it in between. Then the state stays unfinished, and steps are refused.
     """
 
     def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
@@ -87,7 +84,7 @@ class Session:
         self._asked_rows = n_rows
         self._client: Client | None = None
         self._lease: Lease | None = None
-        #: The settings of worlds in this process, with the files that they name.
+        #: The settings of worlds in this process.
         self._own: CheckedSettings | None = None
         self._truth: Newest | Present | None = None
         self._has_warned = False
@@ -140,24 +137,18 @@ class Session:
         return self._state in _UNFINISHED
 
     def begin_step(self) -> None:
-        """Begins a step; refuses it before a reset, or after a call that did not finish."""
         if self._state is not State.READY:
             raise self._no_step()
         self._state = State.BEGUN
 
     def begin_reset(self) -> None:
-        """Begins a reset of all worlds, or of some."""
         self._state = State.TORN if self.is_unfinished else State.BEGUN
 
     def finish(self) -> None:
-        """Ends the step or reset, after the environment has processed its result."""
         self._state = State.READY
 
     def refuse_over(self) -> EmberwatchError:
-        """Returns the error for a shared world whose episode is over.
-
-        Steps raise this error until the next reset.
-        """
+        """Returns the error that steps in a shared world raise after its episode's end."""
         self._state = State.OVER
         return self._no_step()
 
@@ -171,10 +162,9 @@ class Session:
             return self._observe()
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
-        """Begins new episodes in the worlds `indices`; returns the results of all worlds.
+        """Begins episodes in the worlds `indices`, counted from 0; returns all worlds' results.
 
-        `indices` count the session's worlds from 0. If the server has ended, a reset of all worlds
-        connects to a new server of the same instance.
+        If the server has ended, a reset of all worlds connects to a new server of the instance.
         """
         may_move = self.is_open and len(indices) == self.n_worlds
         try:
@@ -202,11 +192,10 @@ class Session:
             return self._observe()
 
     def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
-        """Flies a path with each robot, or with each of the consecutive robots `rows`.
+        """Flies a path with each robot, or with all robots `rows` of some worlds.
 
-        `rows` includes all robots of some worlds. Waits for slow teammates as long as the server
-        runs. If a shared world moved on without this path, the path is dropped, and the answer has
-        the world's current results.
+        If a shared world moved on without this path, the path is dropped, and the answer has the
+        world's current results.
         """
         lease = self._opened()
         robots = None if rows is None else self._robots[rows.start : rows.stop]
@@ -252,10 +241,7 @@ class Session:
             raise self._lost(error) from None
 
     def history(self, row: int, step: int) -> Iterator[StepAnswer]:
-        """Yields the earlier steps of a robot's episode, from the first one that is still kept.
-
-        Warns once if that is not the episode's first step.
-        """
+        """Yields the earlier steps of a robot's episode; warns once if the first are not kept."""
         client, robot, past = self._client, self._robots[row], 0
         while client is not None and past < step:
             try:
@@ -270,14 +256,15 @@ class Session:
                 past = error.detail - 1  # earlier steps are gone, perhaps since the last recall
                 if not self._has_warned_of_gap:
                     self._has_warned_of_gap = True
-                    warn(about_forgotten_steps(row, error.detail))
+                    warn(
+                        f"row {row}: joins an episode whose first {error.detail} steps are no "
+                        "longer kept: its belief and its memory of frames begin with the later "
+                        "ones; start the server with a larger --history"
+                    )
             past += 1
 
     def close(self) -> None:
-        """Releases the worlds; the next reset opens the session again.
-
-        May be called several times, also after an interrupted call.
-        """
+        """Releases the worlds; the next reset opens the session again."""
         self._state = State.CLOSED
         lease, self._lease = self._lease, None
         try:
@@ -293,10 +280,7 @@ class Session:
             self._truth = self._client = None
 
     def _open(self, seed: int) -> None:
-        """Opens the worlds, or waits until the server has finished an interrupted call.
-
-        `seed` is the seed of world 0, for worlds in this process.
-        """
+        """Opens the worlds, or waits for an interrupted call. `seed`: of world 0, if it is here."""
         if self.is_open:
             if self._state is State.TORN:
                 with self._classified():
@@ -330,7 +314,6 @@ class Session:
         )
 
     def _settle(self) -> None:
-        """Waits until the server has finished an interrupted step or reset."""
         client = self._client
         assert client is not None
         # Checks first that the server answers, because the answer to `acquire` may take a whole
@@ -374,10 +357,7 @@ class Session:
             raise
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
-        """Closes the session after a loss, so that a reset opens it again.
-
-        After a timeout, the session stays open, and only its state changes.
-        """
+        """Closes the session after a loss; after a timeout, it stays open."""
         if isinstance(error, RequestTimeoutError):
             self._state = State.TIMED_OUT
         else:
@@ -391,7 +371,6 @@ class Session:
 
     @contextmanager
     def _classified(self) -> Generator[None]:
-        """Updates the state if a reset or resume raises an error."""
         try:
             yield
         except LOST as error:

@@ -173,25 +173,19 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property
     def results(self) -> NDArray[np.void]:
-        """The last result of each robot and its world, `(num_envs,)` of `wire.RESULT_DTYPE`.
-
-        For reports, not for learners.
-        """
+        """The last result of each robot and its world, `(num_envs,)` of `wire.RESULT_DTYPE`."""
         return self._results.copy()
 
     @property
     def truths(self) -> NDArray[np.uint8] | None:
-        """The hidden states of each robot's world, `(num_envs, H, W)`; None if they are not read.
-
-        For reports, not for learners. Do not write to the array.
-        """
+        """The hidden states of each robot's world, `(num_envs, H, W)`. Do not write to them."""
         return self._truths
 
     def close_extras(self, **kwargs: Any) -> None:
         self._close()
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[Any]:
-        """Returns checked actions. If all robots fly, the session checks their paths."""
+        # If all robots fly, the session checks their paths.
         if not self._has_ended:
             return actions
         return as_moves(actions, self.num_envs, self._spec.n_moves)
@@ -222,20 +216,17 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         elif moved.any():
             self._frames = self._frames.copy()  # the learner holds the previous array
             for run in _runs(moved):
-                self._exchange_run(paths, run)
+                rows = slice(run.start, run.stop)
+                answer = self._session.step(paths[rows], run)
+                self._frames[rows], self._results[rows] = answer.frames, answer.results
+                if self._truths is not None:
+                    self._truths[rows] = self._session.truth(answer)
+            self._columns = self._columns_of(self._results)
         self._exchanged = moved
         if self._observations.has_memory:
             self._observations.update(moved, self._results, self._frames)
         if self.render_mode is not None:
             self._keep_paths(moved, self._results, paths)
-
-    def _exchange_run(self, paths: NDArray[Any], run: range) -> None:
-        chosen = slice(run.start, run.stop)
-        answer = self._session.step(paths[chosen], run)
-        self._frames[chosen], self._results[chosen] = answer.frames, answer.results
-        self._columns = self._columns_of(self._results)
-        if self._truths is not None:
-            self._truths[chosen] = self._session.truth(answer)
 
     def _restart(self, rows: list[int], seeds: Sequence[int | None]) -> None:
         """Begins episodes in the worlds of some rows; `seeds` has an entry for every world."""
@@ -264,10 +255,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return tuple(self._generator(world, None)[1] for world in worlds.tolist())
 
     def _reset_episodes(self, rows: list[int], moved: NDArray[np.bool_]) -> None:
-        """Begins or resumes the episodes of some rows.
-
-        In rows that have not `moved` since the last step, the robots' paths and memory continue.
-        """
+        # In rows that have not moved since the last step, the robots' paths and memory continue.
         self._elapsed[rows] = 0
         self._over = self._over.copy()
         self._over[rows] = False
@@ -355,7 +343,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._observations.all(self._shown(), self._robots())
 
     def _shown(self) -> NDArray[np.uint8]:
-        """Returns frames for the learner, copied if pictures need the originals."""
+        # Pictures need the originals, to which learners may write.
         return self._frames if self.render_mode is None else self._frames.copy()
 
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
