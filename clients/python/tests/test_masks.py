@@ -6,9 +6,8 @@ from typing import Any
 import land
 import numpy as np
 import pytest
-from environments import MOVES, SMALL, closed_later, make, make_vec, no_warnings, rollout
+from environments import MOVES, SMALL, closed_later, make, make_vec
 from failures import fails, refuses
-from gymnasium.wrappers import FrameStackObservation
 
 import emberwatch
 
@@ -55,15 +54,6 @@ def test_infos_have_a_lone_robots_mask_for_sampling(world: dict[str, Any]) -> No
 def test_an_enclosed_robot_may_choose_any_move() -> None:
     alone = make(MOVES, height=1, width=1, burn_in=0)
     assert is_mask(alone.reset(seed=1000)[1]["action_mask"], [1, 1, 1, 1])
-
-
-def test_observations_and_infos_hold_the_same_mask(world: dict[str, Any]) -> None:
-    with no_warnings():
-        env = make(MOVES, observation=("robot", "action_mask"), **world)
-        for observation, *_, info in rollout(env, 20, seed=1000):
-            assert is_mask(observation["action_mask"], info["action_mask"].tolist())
-    stacked = FrameStackObservation(env, 3)
-    assert stacked.reset(seed=1000)[0]["action_mask"].tolist() == [EXPECTED] * 3
 
 
 def test_vectors_have_a_mask_for_each_robot(world: dict[str, Any]) -> None:

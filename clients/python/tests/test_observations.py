@@ -20,7 +20,7 @@ from environments import (
 )
 from failures import refuses
 
-from emberwatch.belief import entropy, known
+from emberwatch.belief import known
 from emberwatch.envs.observations import Observations
 from emberwatch.wrappers import BeliefObservation
 
@@ -39,30 +39,6 @@ def test_the_belief_part_is_the_filters_prediction(name: str) -> None:
         predictor.predict()
         assert np.array_equal(seen[number], np.rint(255 * predictor.belief.transpose(1, 2, 0)))
     assert not np.array_equal(seen[0], seen[9])
-
-
-def test_a_window_shows_the_belief_around_the_robot() -> None:
-    env = make(MOVES, **SMALL, observation=("local", "belief", "visited", "robot"), window=5)
-    seen, _ = env.reset(seed=5)
-    steps = [seen, *(env.step(action)[0] for action in actions(env, 20))]
-    for number, seen in enumerate(steps):
-        local = seen["local"]
-        assert local.shape == (5, 5, 5)
-        belief, visited = seen["belief"] / 255, seen["visited"][:, :, 0]
-        left = 1 - visited / 255
-        maps = np.stack((belief[:, :, 2] * left, entropy(belief.transpose(2, 0, 1)) * left), -1)
-        maps[..., 1] /= np.log(3)
-        margin = ((2, 2), (2, 2))
-        row, col = seen["robot"]
-        window = (slice(row, row + 5), slice(col, col + 5))
-        expected = np.pad(maps, (*margin, (0, 0)))[window]
-        assert np.abs(local[..., :2] / 255 - expected).max() < 0.02
-        assert np.array_equal(local[..., 2], np.pad(visited, margin)[window])
-        assert np.array_equal(
-            local[..., 3], np.pad(0 * visited, margin, constant_values=255)[window]
-        )
-        assert (local[..., 4] == np.rint(255 * (1 - number % 6 / 6))).all()
-    assert len({tuple(seen["robot"]) for seen in steps}) > 3
 
 
 def test_a_belief_needs_a_revealed_model() -> None:

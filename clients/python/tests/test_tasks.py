@@ -120,36 +120,24 @@ def test_keywords_set_by_a_task_are_refused() -> None:
         gymnasium.make(WILDFIRE, task="")
 
 
-def test_a_running_server_must_have_the_task() -> None:
-    with serving(task="small", **OF_TASKS) as lab, emberwatch.connect(lab) as client:
-        assert client.info.task == "small"
-        env = gymnasium.make("emberwatch/WildfireSmall-v0", instance=lab)
-        env.reset()
-        env.close()
-        env = gymnasium.make(WILDFIRE, instance=lab)
-        with warns_of_tests("small"):
-            env.reset(seed=0)
-        env.close()
-        with refuses("task: expected the server's 'small', or None, got 'sparse'"):
-            gymnasium.make("emberwatch/WildfireSparse-v1", instance=lab)
-        with refuses("task ash: No such file"):
-            gymnasium.make(WILDFIRE, instance=lab, task="ash")
-
-
 def test_a_running_server_must_match_the_task(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     text = (CONFIG / "tasks/team.toml").read_text("utf-8").replace('"team"', '"own"')
     file.write_text(text, "utf-8")
     with serving(task=file, **OF_TASKS) as lab:
         keywords = {"instance": lab, "task": file, "robot": 0}
-        env = gymnasium.make(WILDFIRE, **keywords)
-        env.reset()
-        env.close()
+        closed_later(gymnasium.make(WILDFIRE, **keywords)).reset()
+        with refuses("task: expected the server's 'own', or None, got 'sparse'"):
+            gymnasium.make("emberwatch/WildfireSparse-v1", instance=lab)
         for old, new in (("robots = 4", "robots = 3"), ("max_steps = 300", "max_steps = 3")):
             assert old in text
             file.write_text(text.replace(old, new), "utf-8")
             with refuses("task 'own': expected the server's worlds, .*, and 300 steps, got "):
                 gymnasium.make(WILDFIRE, **keywords)
+    with serving(task="small", **OF_TASKS) as lab:
+        env = closed_later(gymnasium.make(WILDFIRE, instance=lab))
+        with warns_of_tests("small"):
+            env.reset(seed=0)
 
 
 #: Functions that make environments of a task and reset them on the test world of a seed.

@@ -87,9 +87,9 @@ class WildfireMovesEnv(MovesOwner, WorldEnv):
 
     ## Rewards
 
-    With `reward="share"` (the default), `"team"` or `"marginal"`, as in `WildfireEnv`, the last move
-    of a path gets the path's reward, and all other moves get 0, as cells pay by their state after
-    the world has moved.
+    With `reward="share"` (the default), `"team"` or `"marginal"`, as in `WildfireEnv`, the last
+    move of a path gets the path's reward, and all other moves get 0, as cells pay by their state
+    after the world has moved.
 
     With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
     the world moves. The last move's reward also includes a correction, so that the rewards of a
@@ -99,8 +99,8 @@ class WildfireMovesEnv(MovesOwner, WorldEnv):
 
     ## Episode End
 
-    As in `WildfireEnv`, but `max_episode_steps` counts moves (default 64,000, which is 1,000 paths of
-    64 moves; pass another number for paths of another length).
+    As in `WildfireEnv`, but `max_episode_steps` counts moves (default 64,000, which is 1,000 paths
+    of 64 moves; pass another number for paths of another length).
 
     ## Starting State, Information
 
