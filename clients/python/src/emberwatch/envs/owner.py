@@ -3,6 +3,7 @@
 import pickle
 from contextlib import AbstractContextManager
 from copy import copy
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Final
 
 import gymnasium
@@ -18,7 +19,6 @@ from emberwatch.envs.observations import Observations
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
-from emberwatch.envs.state import EnvState
 from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
 from emberwatch.model.moves import fly
@@ -30,6 +30,21 @@ FPS: Final = 10
 
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 METADATA: Final[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": FPS}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnvState:
+    """The state of an environment, from `clone_state`; it can be pickled.
+
+    Unpickle only states that you saved: like every pickle, a state can run code.
+    """
+
+    form: str
+    """The class of the environment, and what it observes."""
+    worlds: bytes = field(repr=False)
+    """The worlds and robots, in the format of a snapshot file. They contain the hidden states."""
+    memory: bytes = field(repr=False)
+    """The rest: beliefs, memory of frames, moves of incomplete paths, generators."""
 
 
 class SessionOwner:

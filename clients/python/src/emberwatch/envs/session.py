@@ -119,12 +119,14 @@ class Session:
         """Name of the running server."""
         if self.settings.instance is None:
             raise invalid("instance", "an environment made with instance=...", "one without")
-        return self._opened().client.instance
+        return self.lease.client.instance
 
     @property
     def lease(self) -> Lease:
         """The lease on the session's robots."""
-        return self._opened()
+        if self._lease is None:
+            raise not_reset()
+        return self._lease
 
     @property
     def is_open(self) -> bool:
@@ -197,7 +199,7 @@ class Session:
         If a shared world moved on without this path, the path is dropped, and the answer has the
         world's current results.
         """
-        lease = self._opened()
+        lease = self.lease
         robots = None if rows is None else self._robots[rows.start : rows.stop]
         accepts_late, timeout = self._accepts_late, self.settings.timeout
         try:
@@ -337,7 +339,7 @@ class Session:
         self._warn_of_test_worlds(seeds)
         self._open((seeds[0] - indices[0]) & (2**64 - 1))
         with self._classified():
-            lease = self._opened()
+            lease = self.lease
             lease.reset(seeds, worlds=[self._worlds[index] for index in indices])
             self._state = State.MOVED
             answer = self._observe()
@@ -397,13 +399,8 @@ class Session:
             code,
         )
 
-    def _opened(self) -> Lease:
-        if self._lease is None:
-            raise not_reset()
-        return self._lease
-
     def _observe(self) -> StepAnswer:
-        return self._opened().observe(timeout=self.settings.timeout)
+        return self.lease.observe(timeout=self.settings.timeout)
 
     def _check_unchanged(self, client: Client) -> None:
         """Refuses a new server of the instance if its worlds differ from the first server's."""
