@@ -132,7 +132,7 @@ def test_copying_an_open_environment_is_refused(making: Make) -> None:
     again.close()
 
 
-@pytest.mark.parametrize("module", ["emberwatch", "emberwatch.landscape", "emberwatch.render.film"])
+@pytest.mark.parametrize("module", ["emberwatch.landscape", "emberwatch.render.film"])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_reader_that_leaves_ends_a_command_silently(module: str, unbuffered: str) -> None:
     reader, writer = os.pipe()

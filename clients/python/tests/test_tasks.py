@@ -1,7 +1,5 @@
 """Tasks: their names, ids and worlds, which equal worlds with the same settings by hand."""
 
-import subprocess
-import sys
 import tomllib
 import warnings
 from collections.abc import Iterable
@@ -24,15 +22,11 @@ from environments import (
 )
 from failures import refuses
 from gymnasium.utils.env_checker import check_env
-from processes import find
 
 import emberwatch
 from emberwatch._native import built_in
-from emberwatch.benchmark import evaluate, read, suite
+from emberwatch.benchmark import evaluate
 from emberwatch.model.tasks import Task, built_in_tasks
-
-with warnings.catch_warnings(action="ignore"):  # PettingZoo's games warn on import
-    from pettingzoo.test import parallel_api_test
 
 CONFIG = Path(__file__).parents[3] / "config"
 
@@ -108,20 +102,12 @@ def test_a_task_equals_its_settings_by_hand(name: str) -> None:
                 env.close()
 
 
-def test_the_team_task_passes_pettingzoo_and_refuses_one_robot() -> None:
-    with no_warnings():
-        env = emberwatch.parallel_env(task="team")
-        assert len(env.possible_agents) == 4
-        # PettingZoo's test resets with seed 0, and learns nothing.
-        warnings.simplefilter("ignore", emberwatch.TrainingOnTestWorldsWarning)
-        parallel_api_test(env, num_cycles=50)
-        env.close()
-    with refuses("robots: expected one robot in a world, got 4: fly one of them with robot="):
-        gymnasium.make("emberwatch/WildfireTeam-v0")
+def test_the_team_task_has_four_robots() -> None:
+    env = closed_later(emberwatch.parallel_env(task="team"))
+    assert len(env.possible_agents) == 4
     with serving(task="team", **OF_TASKS) as lab:
-        env = gymnasium.make("emberwatch/WildfireTeam-v0", instance=lab, robot=2)
-        env.reset()
-        env.close()
+        one = closed_later(gymnasium.make("emberwatch/WildfireTeam-v0", instance=lab, robot=2))
+        one.reset()
 
 
 def test_keywords_set_by_a_task_are_refused() -> None:
@@ -134,71 +120,24 @@ def test_keywords_set_by_a_task_are_refused() -> None:
         gymnasium.make(WILDFIRE, task="")
 
 
-def test_earlier_versions_of_worlds_are_refused_by_name() -> None:
-    with (
-        pytest.warns(DeprecationWarning),
-        pytest.raises(gymnasium.error.DeprecatedEnv, match="emberwatch/WildfireSparse-v1|`v1`"),
-    ):
-        gymnasium.make("emberwatch/WildfireSparse-v0")
-
-
-def test_a_running_server_must_have_the_task() -> None:
-    with serving(task="small", **OF_TASKS) as lab, emberwatch.connect(lab) as client:
-        assert client.info.task == "small"
-        env = gymnasium.make("emberwatch/WildfireSmall-v0", instance=lab)
-        env.reset()
-        env.close()
-        env = gymnasium.make(WILDFIRE, instance=lab)
-        with warns_of_tests("small"):
-            env.reset(seed=0)
-        env.close()
-        with refuses("task: expected the server's 'small', or None, got 'sparse'"):
-            gymnasium.make("emberwatch/WildfireSparse-v1", instance=lab)
-        with refuses("task ash: No such file"):
-            gymnasium.make(WILDFIRE, instance=lab, task="ash")
-
-
 def test_a_running_server_must_match_the_task(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     text = (CONFIG / "tasks/team.toml").read_text("utf-8").replace('"team"', '"own"')
     file.write_text(text, "utf-8")
     with serving(task=file, **OF_TASKS) as lab:
         keywords = {"instance": lab, "task": file, "robot": 0}
-        env = gymnasium.make(WILDFIRE, **keywords)
-        env.reset()
-        env.close()
+        closed_later(gymnasium.make(WILDFIRE, **keywords)).reset()
+        with refuses("task: expected the server's 'own', or None, got 'sparse'"):
+            gymnasium.make("emberwatch/WildfireSparse-v1", instance=lab)
         for old, new in (("robots = 4", "robots = 3"), ("max_steps = 300", "max_steps = 3")):
             assert old in text
             file.write_text(text.replace(old, new), "utf-8")
             with refuses("task 'own': expected the server's worlds, .*, and 300 steps, got "):
                 gymnasium.make(WILDFIRE, **keywords)
-
-
-def test_a_suite_is_scored_next_to_the_programs_policies(tmp_path: Path) -> None:
-    own = (CONFIG / "tasks/small.toml").read_text("utf-8")
-    for old, new in {'"small"': '"tiny"', "300": "9", "end = 32": "end = 3"}.items():
-        own = own.replace(old, new)
-    file = tmp_path / "tiny.toml"
-    file.write_text(own)
-    keywords: dict[str, Any] = {"tasks": [file], "worlds": 2, "folder": tmp_path / "out"}
-    keywords |= {"observation": "frame", "progress": None}
-
-    def down(frames: Any) -> Any:
-        return np.full(len(frames), 2)
-
-    for policy, name, stem in (
-        (down, "mine", "mine"),
-        ({"tiny": down}, "by+one/task", "by_one_task"),
-    ):
-        rows = suite(policy, name=name, **keywords)
-        assert rows == {"tiny": read(tmp_path / f"out/tiny/{stem}.csv")}
-        assert [(row.world_seed, row.steps) for row in rows["tiny"]] == [(0, 9), (1, 9)]
-    with pytest.raises(TypeError, match="multiple values for keyword argument 'steps'"):
-        suite(down, name="new", steps=3, **keywords)
-    command = [find("emberwatch-agent"), "suite", f"--tasks={file}", f"--out={tmp_path / 'out'}"]
-    command += ["--worlds=2", "--policies=coverage"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert "| mine " in done.stdout and "| by+one/task " in done.stdout, done
+    with serving(task="small", **OF_TASKS) as lab:
+        env = closed_later(gymnasium.make(WILDFIRE, instance=lab))
+        with warns_of_tests("small"):
+            env.reset(seed=0)
 
 
 #: Functions that make environments of a task and reset them on the test world of a seed.
@@ -251,7 +190,7 @@ def test_an_episode_on_a_test_world_warns(own: Path) -> None:
             envs.reset(seed=seed)
 
 
-def test_evaluations_on_test_worlds_do_not_warn(own: Path, tmp_path: Path) -> None:
+def test_evaluations_on_test_worlds_do_not_warn(own: Path) -> None:
     def up(seen: Any) -> Any:
         return np.zeros(len(seen), np.int64)
 
@@ -261,37 +200,13 @@ def test_evaluations_on_test_worlds_do_not_warn(own: Path, tmp_path: Path) -> No
         assert [row.world_seed for row in rows] == [5, 6]
         (row,) = evaluate(up, task="team", steps=1, seeds=[0], **common)
         assert row.robots == 4
-        suite(up, tasks=[own], worlds=1, folder=tmp_path / "suite", **common)
 
 
-#: Resets several environments at two places, first with the warning switched off.
-RESETS = """
-import warnings, gymnasium, emberwatch
-from gymnasium.vector import SyncVectorEnv
-
-def make():
-    return gymnasium.make("emberwatch/WildfireSmallMoves-v0", observation="frame")
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", emberwatch.TrainingOnTestWorldsWarning)
-    env = make()
-    env.reset(seed=3)
-    print("by hand", flush=True)
-envs = SyncVectorEnv([make] * 3)
-envs.reset(seed=0)
-env.reset(seed=1)
-for _ in range(3):
-    envs.reset(seed=0)
-envs.close()
-env.close()
-"""
-
-
-def test_the_warning_appears_once_unless_suppressed() -> None:
-    command = [sys.executable, "-c", RESETS]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout) == (0, "by hand\n"), done.stderr
-    assert done.stderr.count("TrainingOnTestWorldsWarning: task 'small'") == 1
-    command[1:1] = ["-W", "ignore::UserWarning"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stderr) == (0, "")
+def test_the_warning_appears_once() -> None:
+    envs = [closed_later(gymnasium.make("emberwatch/WildfireSmall-v0")) for _ in range(3)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for env in envs:
+            env.reset(seed=3)
+            env.reset(seed=1)
+    assert [each.category for each in caught] == [emberwatch.TrainingOnTestWorldsWarning]

@@ -74,8 +74,10 @@ def test_unsuitable_vector_environments_are_refused() -> None:
     with refuses("env: expected an environment of emberwatch from"):
         WildfireVecEnv(gymnasium.make_vec(MOVES, num_envs=2, **IMAGE))
     vector = make_vec_env(MOVES, 2, **IMAGE)
-    assert vector.get_attr("n_moves") == [4, 4] and vector.env_is_wrapped(VecMonitor) == [False] * 2
-    for call in (lambda: vector.set_attr("n_moves", 3), lambda: vector.env_method("step")):
+    assert (
+        vector.get_attr("burn_in") == [10, 10] and vector.env_is_wrapped(VecMonitor) == [False] * 2
+    )
+    for call in (lambda: vector.set_attr("burn_in", 3), lambda: vector.env_method("step")):
         with refuses("all worlds share one environment"):
             call()
     with refuses("set_options: expected no options, as resets"):

@@ -2,7 +2,6 @@
 
 import copy
 import os
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -21,7 +20,6 @@ from environments import (
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import emberwatch
-from emberwatch.errors import LeaseLostError
 
 PARTS = ("frame", "robot", "age")
 
@@ -38,13 +36,8 @@ Vector = VectorEnv[Any, Any, Any]
 
 
 def sync_of(n_worlds: int, mode: AutoresetMode, **keywords: Any) -> Vector:
-    """Returns the same worlds as single environments; with `instance`, a server's worlds."""
-
-    def maker(world: int) -> Callable[[], gymnasium.Env[Any, Any]]:
-        place = {} if keywords.get("instance") is None else {"world": world}
-        return lambda: make(**{**keywords, **place})
-
-    return SyncVectorEnv([maker(world) for world in range(n_worlds)], autoreset_mode=mode)
+    """Returns the same worlds as single environments."""
+    return SyncVectorEnv([lambda: make(**keywords)] * n_worlds, autoreset_mode=mode)
 
 
 def pair(n_worlds: int, mode: AutoresetMode, **keywords: Any) -> tuple[Vector, Vector]:
@@ -111,17 +104,11 @@ def test_every_field_equals_that_of_single_environments(
     assert_same_flight(ours, theirs, 2, seed=None)
 
 
-@by_name
-def test_worlds_of_running_servers_are_the_same(name: str) -> None:
-    # The servers truncate by themselves, and the vector's worlds begin at the server's world 2.
-    flags = {"publish_truth": True, "max_steps": 3}
-    with serving(worlds=5, seed=40, **flags) as one, serving(worlds=3, seed=9, **flags) as other:
-        ours = make_vec(3, name, instance=one, world=2, truth=True)
-        theirs = sync_of(3, AutoresetMode.NEXT_STEP, name=name, instance=other, truth=True)
+def test_a_vector_flies_the_servers_worlds_from_its_first_one_on() -> None:
+    with serving(worlds=5, publish_truth=True) as lab:
+        ours, theirs = make_vec(3, instance=lab, world=2, truth=True), make_vec(3, truth=True)
         assert_same_flight(ours, theirs, 2, seed=6)
-        assert_same_resets(ours, theirs, [False, True, False])
-        assert assert_same_steps(ours, theirs, 32 if name == MOVES else 8) > 4
-        with emberwatch.connect(one) as client:
+        with emberwatch.connect(lab) as client:
             holders = [world.holder_pids for world in client.status().worlds]
         pid = os.getpid()
         assert holders == [(None,), (None,), (pid,), (pid,), (pid,)]
@@ -212,18 +199,3 @@ def test_pictures_equal_those_of_single_environments(name: str) -> None:
         ours.step(action)
         theirs.step(action)
         assert_same(ours.render(), theirs.render(), f"step {step}")
-
-
-@by_name
-def test_a_takeover_of_one_world_ends_the_whole_lease(name: str) -> None:
-    with serving(worlds=3) as instance:
-        env = make_vec(3, name, instance=instance)
-        env.reset(seed=1)
-        thief = make(instance=instance, world=1, takeover=True)
-        thief.reset(options={"resume": True})
-        with pytest.raises(LeaseLostError) as caught:
-            for _ in range(4):  # moves of a path
-                env.step(np.zeros(env.action_space.shape, int))
-        assert caught.value.detail == os.getpid()
-        thief.close()
-        assert env.reset(seed=1)[1]["step"].tolist() == [0, 0, 0]

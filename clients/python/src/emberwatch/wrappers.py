@@ -1,8 +1,4 @@
-"""`BeliefObservation`: replaces the observed frame with a belief about all cells.
-
-A frame shows only the cells of one path. A belief sums up all frames so far, so that a policy
-without memory can act on it.
-"""
+"""`BeliefObservation`: replaces the observed frame with a belief about all cells."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -25,27 +21,23 @@ from emberwatch.model import Model
 
 
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
-    """Observes a belief about an environment's world instead of its frames.
+    """Observes a belief about an environment's world, from all frames so far, instead of frames.
 
-    By default the belief is of the recommended kind, which knows the environment's model. The
-    wrapper is for single environments; wrap the environments of a vector one by one. `terminated`
-    and `truncated` pass through, and only `reset` resets the belief.
+    The wrapper is for single environments; wrap the environments of a vector one by one.
 
     Emberwatch's environments report the world's step k in ``info["step"]``, and the belief follows
-    it. After a step that makes only one move of a path, the belief stays as it is. After a step
-    that flies several paths, the belief is predicted once per path and corrected with the last
-    frame. A reset that resumes or joins an episode (`resume`, `robot`) continues from the frames
-    that the server keeps of it, and warns if some are missing. In environments that do not report
-    k, each step of the environment counts as one step of the world.
+    it: it is predicted once for each step of the world, and corrected with the last frame. A reset
+    that resumes or joins an episode (`resume`, `robot`) continues from the frames that the server
+    keeps of it, and warns if some are missing. In environments that do not report k, each step of
+    the environment counts as one step of the world.
 
     ## Observations
     After `reset`, the observation is the prior about ``X_0``, the world after its burn-in. A step
     moves the world from ``X_k`` to ``X_{k+1}``, and its frame shows ``X_{k+1}``. The filter
     predicts, then corrects. The observation is the posterior about ``X_{k+1}``, given all frames
-    (eqs. 5 and 6), with the same numbers as the Rust agent's. The agent plans on the predictor, the
-    belief about the state that the next path will observe. To compute it from an observation of the
-    kind ``"known"``, call `predict` on ``emberwatch.belief.known(model, prior=observation,
-    kind="known")``.
+    (eqs. 5 and 6), with the same numbers as the Rust agent's. The agent plans on the predictor,
+    which `predict` of ``emberwatch.belief.known(model, prior=observation, kind="known")`` computes
+    from an observation of the kind ``"known"``.
 
     - ``dtype="float32"``: a `Box` of 0 to 1, shape (S, H, W). The S numbers of a cell sum to 1.
     - ``dtype="uint8"``: the same numbers times 255, rounded, shape (H, W, S). This is an image for
@@ -55,8 +47,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     ## Priors
     - ``"simulated"``: how often each cell is in each state after the burn-in of 64 simulated
-      worlds. The simulation takes some seconds; other processes that need it wait, and later calls
-      read its result from ``~/.cache/emberwatch``.
+      worlds, which takes some seconds; later calls read it from ``~/.cache/emberwatch``.
     - ``"initial"``: the model's initial distribution, which is exact for worlds without burn-in.
     - ``"uniform"``: every state equally likely.
     - An array of shape (S, H, W), in which the numbers of each cell sum to 1.

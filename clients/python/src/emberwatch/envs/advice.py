@@ -37,14 +37,6 @@ def about_barren_worlds(spec: WorldSpec, answer: StepAnswer) -> str | None:
     )
 
 
-def about_forgotten_steps(row: int, step: int) -> str:
-    """Returns advice about an episode that is joined at a step whose past is not all kept."""
-    return (
-        f"row {row}: joins an episode whose first {step} steps are no longer kept: its belief and "
-        "its memory of frames begin with the later ones; start the server with a larger --history"
-    )
-
-
 def warn_of_test_worlds(task: Task | None, seeds: Sequence[int]) -> None:
     """Warns if episodes begin with seeds that a task reserves for tests."""
     if task is None or not any(seed in task.test_seeds for seed in seeds):

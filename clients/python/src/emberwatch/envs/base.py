@@ -9,19 +9,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch.client.wire import UNOBSERVED, StepAnswer
-from emberwatch.common.arguments import as_moves, as_seed
+from emberwatch.common.arguments import as_seed
 from emberwatch.envs.observations import Observations
-from emberwatch.envs.owner import SessionOwner
+from emberwatch.envs.owner import METADATA, SessionOwner
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session, not_reset
 from emberwatch.envs.settings import draw_seed
-from emberwatch.envs.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.errors import InvalidArgumentError, invalid, repr_of
-from emberwatch.model.moves import fly
-
-NOTHING_TO_DRAW: Final = (
-    "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
-)
 
 #: Kinds of reward, in the order of the native module's `pays`.
 REWARDS: Final = ("share", "team", "marginal")
@@ -34,10 +28,8 @@ ONE_ROW: Final = np.ones(1, np.bool_)
 class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """An environment of one robot, in its own world or in a world of a running server."""
 
-    metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
-        "render_modes": list(RENDER_MODES),
-        "render_fps": RENDER_FPS,
-    }
+    metadata: ClassVar[dict[str, Any]] = METADATA  # pyright: ignore[reportIncompatibleVariableOverride]
+    _KEPT = ("_np_random", "_np_random_seed", "_paths")
 
     def __init__(
         self,
@@ -47,16 +39,9 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         *,
         pays: int,
     ) -> None:
-        """`pays` is the kind of reward, an index in `REWARDS`."""
-        self._session = session
-        self._spec: Final = session.spec
-        self._observations = observations
-        self._pays = pays
+        self._attach(session, observations, pays)
         self.observation_space = observations.space
         self.action_space = action_space
-        self.render_mode = session.settings.render_mode
-        self._view = View(self.render_mode, self._spec)
-        self._reveals = session.settings.reveals
         #: The robot's index in a world that other clients fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
         #: Whether observations contain the robot's teammates, whom another client may fly.
@@ -66,13 +51,11 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self.continues = False
         self._answer: StepAnswer | None = None
         self._teams: StepAnswer | None = None
-        self._truth: NDArray[np.uint8] | None = None
-        self._path: NDArray[np.intp] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode, or with `robot` joins the current episode of the shared world.
+        """Begins an episode, or joins the current one.
 
         See `WildfireEnv`, *Starting State* and *One Robot of a Team*.
         """
@@ -82,7 +65,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
                 self._observations.start_episodes(ONE_ROW, answer.results, answer.frames)
                 self._take(answer)
             else:  # learners may have written to the arrays
-                self._numbers = answer.numbers(self._pays)
+                self._frames, self._numbers = answer.frames, answer.numbers(self._pays)
             seen = self._seen()
             self._session.finish()
         return seen
@@ -109,21 +92,16 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
 
     def render(self) -> Any:
         """Draws the last frame, path and robot; next to them the hidden states, if revealed."""
-        if self.render_mode is None or not self.is_open:
-            gymnasium.logger.warn(NOTHING_TO_DRAW)
+        if not self.can_draw() or self._answer is None or self.render_mode == "human":
             return None
-        return None if self.render_mode == "human" else self._draw()
+        return self.draw(slice(0, 1))
 
     def close(self) -> None:
-        self._session.close()
-        self._view.close()
+        self._close()
         self._answer = self._teams = None  # answers cannot be copied or pickled
 
     def past_frames(self) -> Iterator[NDArray[np.uint8]]:
-        """Yields the robot's frames before the current step, `(H, W)`, from the first that is kept.
-
-        Warns once if frames from the beginning of the episode are no longer kept.
-        """
+        """Yields the robot's earlier frames of the episode, `(H, W)`; warns if some are missing."""
         if self._answer is None:
             raise not_reset()
         step = int(self._answer.worlds["step"][0])
@@ -146,25 +124,13 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         told = processed.results.tobytes() if resumes and processed is not None else None
         self.continues = answer.results.tobytes() == told
         if not self.continues:
-            self._path, self._n_missed = None, 0
+            self._paths[0], self._n_missed = None, 0
         return answer
 
-    def _memory(self) -> dict[str, Any]:
-        return {
-            "generator": (self.np_random, self._np_random_seed),
-            "path": self._path,
-            "observations": self._observations.memory(),
-        }
-
-    def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
-        self._path = memory["path"]
-        self._np_random, self._np_random_seed = memory["generator"]
-        self._truth = self._session.truth(answer)[0] if self._reveals else None
+    def _restore(self, answer: StepAnswer) -> None:
         self._take(answer)
-        self._observations.restore(memory["observations"], answer.results)
 
     def _fly(self, path: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Flies a path, and returns the outcome of the step."""
         answer = self._session.step(path)
         if self._robot is not None:
             self._n_missed = self._session.n_skipped + (int(answer.robots["n_moves"][0]) == 0)
@@ -174,28 +140,26 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
                 self._observations.update(ONE_ROW, answer.results, unseen)
             self._observations.update(ONE_ROW, answer.results, answer.frames)
         if self.render_mode is not None:
-            robot, moves = answer.result().robot, as_moves(path, 1, self._spec.n_moves)
-            self._path = fly(robot.start, moves.reshape(-1)[: robot.n_moves], self._spec)
+            self._keep_paths(ONE_ROW, answer.results, path)
         self._take(answer)
         reward, terminated, truncated, *_ = self._numbers
         observation, info = self._seen()
         return observation, reward, terminated, truncated, info
 
     def _take(self, answer: StepAnswer) -> None:
-        """Stores the results of the current step."""
-        self._answer = answer
+        self._answer, self._frames = answer, answer.frames
         self._numbers = answer.numbers(self._pays)
+        if self._reads_truth:
+            self._truths = self._session.truth(answer)
         if self._needs_teams:
             self._teams = self._session.teams(answer)
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
-        """Returns the observation and the info."""
-        assert self._answer is not None
-        frames, info = self._answer.frames, self._info()
+        frames, info = self._frames, self._info()
         if self.render_mode is not None:
             frames = frames.copy()  # the learner may write to it, and pictures show the original
             if self.render_mode == "human":
-                self._draw()
+                self.draw(slice(0, 1))
         return self._observations.one(frames, self._numbers[5], self._teams), info
 
     def _info(self) -> dict[str, Any]:
@@ -205,23 +169,15 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         if self._robot is not None:
             info["n_missed"] = self._n_missed
         if self._reveals:
-            assert self._answer is not None
+            assert self._answer is not None and self._truths is not None
             world, robot = self._answer.result()
             info |= {"n_target_cells": world.n_target_cells, "n_hits": robot.n_hits}
-            self._truth = truth = self._session.truth(self._answer)[0]
-            info["truth"] = truth.copy()
+            info["truth"] = self._truths[0].copy()
         return info
 
-    def _draw(self) -> Any:
-        if self._answer is None:
-            return None
-        cells, paths = [self._cell()], [] if self._path is None else [self._path]
-        return self._view.draw(self._answer.frames[0], cells, paths, self._truth)
-
-    def _cell(self) -> tuple[int, int]:
-        """Returns the cell at which the robot is drawn."""
+    def _robots(self) -> NDArray[np.int64]:
         assert self._answer is not None
-        return self._answer.result().robot.cell
+        return self._answer.numbers(self._pays)[5]
 
 
 def check_reward(reward: str, *more: str) -> int:
@@ -243,10 +199,10 @@ def as_options(options: object) -> dict[str, Any]:
 
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
     """Returns whether a reset continues the current episode, from the option `resume`."""
-    for key in as_options(options):
-        if key != "resume":
-            raise invalid("options", "'resume'", repr_of(key))
-    resume = as_options(options).get("resume", False)
+    given = as_options(options)
+    resume = given.pop("resume", False)
+    if given:
+        raise invalid("options", "'resume'", repr_of(next(iter(given))))
     if not isinstance(resume, bool):
         raise invalid("options", "resume True or False", repr_of(resume))
     if resume and seed is not None:

@@ -1,32 +1,56 @@
 """`emberwatch/WildfireMoves-v0`: one step is one move, and the world moves after T moves."""
 
-from typing import Any, Literal, TypeAlias, Unpack
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from emberwatch._native import Flights
 from emberwatch.client import wire
 from emberwatch.client.wire import StepAnswer
 from emberwatch.common.arguments import as_choice, as_choices
 from emberwatch.envs.base import ONE_ROW, Reward, WorldEnv, check_reward
 from emberwatch.envs.observations import WINDOW, MovesParts, Observations
+from emberwatch.envs.owner import SessionOwner
+from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session, not_reset
-from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
-from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
+from emberwatch.envs.settings import Settings, shows_keywords
+from emberwatch.envs.vector_base import WorldVectorEnv
 from emberwatch.model.moves import fly
 
 MovesReward: TypeAlias = Literal[Reward, "move"]
 
 
-class WildfireMovesEnv(WorldEnv):
+class MovesOwner(SessionOwner):
+    """Robots that fly move by move."""
+
+    _flights: Flights
+
+    def _attach(self, session: Session, observations: Observations | Plans, pays: int) -> None:
+        assert isinstance(observations, Observations) and observations.flights is not None
+        super()._attach(session, observations, pays)
+        self._flights = observations.flights
+
+    def _masks(self) -> NDArray[np.int8]:
+        if not self.is_open:
+            raise not_reset()
+        return self._flights.masks
+
+    def _robots(self) -> NDArray[np.int64]:
+        return self._flights.robots
+
+    def _path(self, row: int) -> NDArray[np.intp] | None:
+        made = self._flights.made(row)
+        return fly(super()._robots()[row], made, self._spec) if len(made) else super()._path(row)
+
+
+class WildfireMovesEnv(MovesOwner, WorldEnv):
     """The world of `WildfireEnv`, flown move by move.
 
-    ## Description
-
-    Like `WildfireEnv`, but one step is one move of the robot. After T moves the path is complete.
-    Then the world moves once, and the visited cells are observed and rewarded.
+    One step is one move of the robot. After T moves the path is complete. Then the world moves
+    once, and the visited cells are observed and rewarded.
 
     ## Action Space
 
@@ -45,46 +69,38 @@ class WildfireMovesEnv(WorldEnv):
 
     | part | space | meaning |
     |---|---|---|
-    | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells that this path has visited |
+    | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in cells that this path has visited |
     | `move` | `Discrete(T)` | number of moves made on this path |
     | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
     | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | the last observations around the robot |
     | `action_mask` | `Box(0, 1, (4,), int8)` | 1 for each move that leads to another cell |
 
-    `local` has five channels, whose values are multiplied by 255:
-
-    1. The probability of the state that pays most.
-    2. The entropy of the belief divided by log S. Channels 1 and 2 are 0 in the cells that this
-       path has visited.
-    3. 1 in the cells that this path has visited.
-    4. 1 off the grid and in no-fly cells.
-    5. The share of the path's moves that remain, the same in all cells.
+    `local` has five channels, whose values are multiplied by 255: the probability of the state that
+    pays most; the entropy of the belief divided by log S; 1 in the cells that this path has
+    visited; 1 off the grid and in no-fly cells; the share of the path's moves that remain. The
+    first two are 0 in visited cells.
 
     `recent` needs no model. It has one channel for each of the O observed values. The channel of a
     cell's last observed value is 255 if the last frame observed it, and halves every 16 steps; the
-    cell's other channels are 0. In cells that this path has visited, all O channels are 0. The last
-    three channels are channels 3 to 5 of `local`.
+    cell's other channels are 0, and all O in visited cells. The last three channels are those of
+    `local`.
 
     ## Rewards
 
-    With `reward="share"` (the default), `"team"` or `"marginal"`, the last move of a path gets the
-    path's reward, and all other moves get 0. Cells pay by their state after the world has moved, so
-    the reward is known only after the last move. These three rewards differ only in worlds of
-    several robots, as in `WildfireEnv`.
+    With `reward="share"` (the default), `"team"` or `"marginal"`, as in `WildfireEnv`, the last
+    move of a path gets the path's reward, and all other moves get 0, as cells pay by their state
+    after the world has moved.
 
     With `reward="move"`, each cell pays when the path first visits it, by its hidden state before
     the world moves. The last move's reward also includes a correction, so that the rewards of a
-    path sum to the robot's share of the path's true reward, as with `"share"`. The correction is
-    small for a lone robot, as one step changes few cells. But `"move"` reveals more about the
-    hidden state than `"share"` does, and earlier, so results with the two rewards are not
-    comparable. `"move"` needs the hidden states: with `instance`, the server must publish them.
+    path sum to the robot's share, as with `"share"`. But `"move"` reveals more about the hidden
+    state, and earlier, so results with the two rewards are not comparable. With `instance`, the
+    server must publish the hidden states.
 
     ## Episode End
 
-    Never `terminated`. `truncated` after `max_episode_steps` moves (default 64,000, which is 1,000
-    paths of 64 moves, or the length of the task whose id it is; pass another number to
-    `gymnasium.make`, as for paths of another length), or after the number of paths set
-    by the task or by the running server's `--max-steps`.
+    As in `WildfireEnv`, but `max_episode_steps` counts moves (default 64,000, which is 1,000 paths
+    of 64 moves; pass another number for paths of another length).
 
     ## Starting State, Information
 
@@ -119,16 +135,13 @@ class WildfireMovesEnv(WorldEnv):
         reward: MovesReward = "share",
         window: int = WINDOW,
         kind: str = "known",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
-        session = Session(settings)
-        pays = check_reward(reward, "move")
+        session, pays = Session(settings), check_reward(reward, "move")
         parts = Observations(observation, session, kind, window=window, pays=reward == "move")
         super().__init__(session, parts, spaces.Discrete(wire.N_MOVES), pays=pays)
-        assert parts.flights is not None
-        self._flights = parts.flights
 
     def step(self, action: np.integer[Any] | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one move. Move number T completes the path and moves the world.
@@ -149,9 +162,7 @@ class WildfireMovesEnv(WorldEnv):
 
         All 1 if no move leads to another cell. The same as `info["action_mask"]`.
         """
-        if not self.is_open:
-            raise not_reset()
-        return self._flights.masks[0]
+        return self._masks()[0]
 
     def _move(self, move: NDArray[np.uint8]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Makes a move that does not complete its path."""
@@ -168,35 +179,19 @@ class WildfireMovesEnv(WorldEnv):
 
     def _take(self, answer: StepAnswer) -> None:
         super()._take(answer)
-        self._start = self._numbers[5]
-        states = self._session.truth(answer) if self._session.settings.truth else None
-        self._flights.start_paths(ONE_ROW, self._start, states)
+        self._flights.start_paths(ONE_ROW, self._numbers[5], self._truths)
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
-        assert self._answer is not None
         info = self._info()
         info["action_mask"] = self._flights.masks[0]
         if self.render_mode == "human":
-            self._draw()
+            self.draw(slice(0, 1))
         # Copied, because each move of a path returns the same frame.
-        frames = self._answer.frames.copy()
+        frames = self._frames.copy()
         return self._observations.one(frames, self._flights.robots, self._teams), info
 
-    def _draw(self) -> Any:
-        made, path = self._flights.made(0), self._path
-        if len(made):
-            row, col = self._start[0].tolist()
-            self._path = fly((row, col), made, self._spec)
-        picture = super()._draw()
-        self._path = path
-        return picture
 
-    def _cell(self) -> tuple[int, int]:
-        row, col = self._flights.robots[0].tolist()
-        return row, col
-
-
-class WildfireMovesVectorEnv(WorldVectorEnv):
+class WildfireMovesVectorEnv(MovesOwner, WorldVectorEnv):
     """Many robots of `WildfireMovesEnv`, stepped together.
 
     One message flies the paths of all robots that complete a path. Takes the arguments of
@@ -215,18 +210,15 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         reward: MovesReward = "share",
         window: int = WINDOW,
         kind: str = "known",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
         pays = check_reward(reward, "move")
         settings = Settings.of(WildfireMovesVectorEnv, world, needs_truth=reward == "move")
-        session = vector_session(settings, num_envs)
-        parts = Observations(observation, session, kind, window=window, pays=reward == "move")
-        assert parts.flights is not None
-        self._flights = parts.flights
+        session = Session(settings, num_envs)
         super().__init__(
             session,
-            parts,
+            Observations(observation, session, kind, window=window, pays=reward == "move"),
             spaces.Discrete(wire.N_MOVES),
             pays=pays,
             max_episode_steps=max_episode_steps,
@@ -235,9 +227,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
 
     def action_masks(self) -> NDArray[np.int8]:
         """Returns the masks of all robots, `(num_envs, 4)`; see `WildfireMovesEnv.action_masks`."""
-        if not self.is_open:
-            raise not_reset()
-        return self._flights.masks
+        return self._masks()
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         return as_choices(actions, self.num_envs, wire.N_MOVES)
@@ -260,16 +250,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         return {**super()._reported(), "action_mask": self._flights.masks}
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
-        self._flights.start_paths(begun, super()._robots(), self._truths)
-
-    def _robots(self) -> NDArray[np.int64]:
-        return self._flights.robots
+        self._flights.start_paths(begun, self._columns.cells, self._truths)
 
     def _shown(self) -> NDArray[np.uint8]:
         return self._frames.copy()  # each move of a path returns the same frames
-
-    def _path(self, row: int) -> NDArray[np.intp] | None:
-        if not self._flights.n_made[row]:
-            return super()._path(row)
-        start_row, start_col = super()._robots()[row].tolist()
-        return fly((start_row, start_col), self._flights.made(row), self._spec)

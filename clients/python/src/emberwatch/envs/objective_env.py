@@ -1,7 +1,7 @@
 """`emberwatch/WildfireObjective-v1`: one step chooses the objective of the next path."""
 
 from os import PathLike
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -11,18 +11,16 @@ from emberwatch.common.arguments import as_choice, as_choices
 from emberwatch.envs.base import WorldEnv
 from emberwatch.envs.plans import FirstBelief, Plans, PlansOwner
 from emberwatch.envs.session import Session
-from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
-from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
+from emberwatch.envs.settings import Settings, shows_keywords
+from emberwatch.envs.vector_base import WorldVectorEnv
 
 
 class WildfireObjectiveEnv(PlansOwner, WorldEnv):
     """The paper's high-level decision: an action chooses the objective of the robot's next path.
 
-    ## Description
-
-    The world is the same as in `WildfireEnv`. The environment keeps a belief about the world, plans
-    a path for each of eight objectives, and describes each planned path by features. The learner,
-    in the role of the paper's deep Q-network (section III.E), chooses which path is flown.
+    The environment keeps a belief about the world of `WildfireEnv`, plans a path for each of eight
+    objectives, and describes each planned path by features. The learner, in the role of the paper's
+    deep Q-network (section III.E), chooses which path is flown.
 
     ## Action Space
 
@@ -42,8 +40,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
 
     As in `WildfireEnv`. The first belief is the one that `prior` names, or the learned one. With
     ``reset(options={"resume": True})``, it is the belief that the last agent left for the world's
-    current step. If no agent left a belief, it is computed from the frames of this episode that the
-    server keeps.
+    current step, or is computed from the frames of this episode that the server keeps.
 
     ## Rewards, Episode End, Information
 
@@ -80,7 +77,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
         estimator: str | None = None,
         checkpoint: str | PathLike[str] | None = None,
         prior: FirstBelief = "simulated",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
         session = Session(Settings.of(WildfireObjectiveEnv, world))
@@ -119,10 +116,10 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
         estimator: str | None = None,
         checkpoint: str | PathLike[str] | None = None,
         prior: FirstBelief = "simulated",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
-        session = vector_session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
+        session = Session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)
         self._plans = plans = Plans(session, estimator, checkpoint, prior)
         super().__init__(
             session,

@@ -1,7 +1,7 @@
 """Observations of learners: their parts, and the space of each part."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import zip_longest
+from collections.abc import Iterable, Sequence
+from itertools import chain, zip_longest
 from typing import Any, Final, Literal, TypeAlias, cast
 
 import numpy as np
@@ -13,7 +13,6 @@ from emberwatch.belief import Belief, kinds, known
 from emberwatch.belief.prior import prior_of
 from emberwatch.client import wire
 from emberwatch.common.arguments import as_integer
-from emberwatch.envs.flights import flights_of
 from emberwatch.envs.last_seen import LastSeen
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
@@ -32,11 +31,8 @@ WINDOW: Final = 15
 #: Maximum side of the parts `local` and `recent`, in cells.
 MAX_WINDOW: Final = 255
 
-#: Number of channels of `local` that come from the belief.
+#: Number of the first channels of `local`, from the belief, and of its last ones, about the path.
 N_OF_BELIEF: Final = 2
-
-#: Number of the last channels of `local` and `recent`: visited cells, cells off the grid or no-fly,
-#: share of the moves that remain.
 N_OF_PATH: Final = 3
 
 #: Parts that need a filter, parts that need a memory of frames, and parts about other robots.
@@ -98,8 +94,14 @@ class Observations:
         #: The paths of robots that fly move by move.
         self.flights: Flights | None = None
         if window is not None:
+            if pays and spec.described is None:
+                needs = "reward='move': expected a server that reveals its model"
+                raise InvalidArgumentError(needs)
+            # Each cell pays the reward of its hidden state when the path first visits it.
+            reward = spec.described.reward.tolist() if pays and spec.described else None
             windows = [(window, channels[name]) for name in self._windows]
-            self.flights = flights_of(spec, n_rows, windows, pays=pays)
+            size = n_rows, spec.height, spec.width, spec.n_moves
+            self.flights = Flights(*size, reward, spec.airspace, windows)
         #: Whether observations depend on frames before the last one.
         self.has_memory = has_memory(names)
         self._image = np.empty(0, np.uint8)
@@ -122,7 +124,13 @@ class Observations:
         joined = begun & (steps > 0) & self.has_memory
         self._reset(begun & ~joined, frames)
         rows = np.flatnonzero(joined).tolist()
-        each = [self._until(int(steps[row]), row, frames) for row in rows]
+        each = [
+            chain(
+                (past.frames[0] for past in self._session.history(row, int(steps[row]))),
+                [frames[row]],
+            )
+            for row in rows
+        ]
         seen = np.zeros_like(frames)
         # The rows join together, because each update takes the time of all rows.
         for number, shown in enumerate(zip_longest(*each)):
@@ -135,12 +143,6 @@ class Observations:
             else:
                 self.update(moved, results, seen)
 
-    def _until(self, step: int, row: int, frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
-        """Yields the frames of a row that are still kept, then its frame of the step."""
-        for past in self._session.history(row, step):
-            yield past.frames[0]
-        yield frames[row]
-
     def _reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
         """Forgets everything in the rows `begun`, then shows their frames, (n_rows, H, W)."""
         if not begun.any():
@@ -148,7 +150,12 @@ class Observations:
         if self._last_seen is not None:
             self._last_seen.reset(begun, frames)
         if OF_BELIEF & set(self._names):
-            self._belief = self._belief or self._first_belief()
+            if self._belief is None:
+                spec, model = self._spec, self._spec.model
+                assert model is not None
+                grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
+                prior = prior_of(None, model, **grid)
+                self._belief = known(model, prior=prior, kind=self._kind, n_worlds=self._n_rows)
             self._belief.reset(begun)
             self._belief.correct(frames, begun)
             self._belief.predict(begun)
@@ -198,13 +205,10 @@ class Observations:
         robots: NDArray[np.int64],
         teams: wire.StepAnswer | None = None,
     ) -> Any:
-        """Returns the observations of all rows, stacked.
+        """Returns the observations of all rows, stacked; `frames` and `robots` are not copied.
 
-        Args:
-            frames: The frames of all rows; not copied.
-            robots: Row and column of each robot; not copied.
-            teams: The team frames, and the results of all robots of the worlds. Needed if the rows
-                do not include all robots of their worlds.
+        `teams` has the team frames and the results of all robots of the worlds. It is needed if the
+        rows do not include all robots of their worlds.
         """
         parts = {name: self._part(name, frames, robots, teams) for name in self._names}
         return parts[self._names[0]] if self._is_plain else parts
@@ -240,7 +244,10 @@ class Observations:
         if name == "robot":
             return robots
         if name == "team":
-            seen = team_frames(frames, self._spec.n_robots) if teams is None else teams.frames
+            if teams is None:  # unobserved is 255
+                seen = frames.reshape(-1, self._spec.n_robots, *frames.shape[1:]).min(axis=1)
+            else:
+                seen = teams.frames
             return np.repeat(seen, self._n_rows // len(seen), axis=0)[..., np.newaxis]
         if name == "others":
             return self._others(robots if teams is None else cells_of(teams.robots))
@@ -268,13 +275,6 @@ class Observations:
         shown[rows, cells[:, 0], cells[:, 1]] = 255
         return shown
 
-    def _first_belief(self) -> Belief:
-        spec = self._spec
-        assert spec.model is not None
-        grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
-        prior = prior_of(None, spec.model, **grid)
-        return known(spec.model, prior=prior, kind=self._kind, n_worlds=self._n_rows)
-
     def _show(self, rows: NDArray[np.bool_]) -> None:
         """Updates the beliefs and windows of `rows`, in which a new path begins."""
         if self._belief is not None and "belief" in self._names:
@@ -298,11 +298,6 @@ def _local(belief: Belief, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
     entropy = belief.entropy() / np.log(len(belief.state_names))
     channels = np.stack((target[rows], entropy[rows]), axis=-1)
     return np.rint(255.0 * channels).astype(np.uint8)
-
-
-def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:
-    """Returns the frame of each world's team, `(n_worlds, H, W)`."""
-    return frames.reshape(-1, n_robots, *frames.shape[1:]).min(axis=1)  # unobserved is 255
 
 
 def cells_of(robots: NDArray[np.void]) -> NDArray[np.int64]:

@@ -1,30 +1,77 @@
-"""The public attributes that all environments and vector environments share."""
+"""What all environments and vector environments share."""
 
+import pickle
 from contextlib import AbstractContextManager
 from copy import copy
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Final
 
+import gymnasium
+import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from numpy.typing import ArrayLike, NDArray
 
 from emberwatch.client.client import Lease
 from emberwatch.client.wire import StepAnswer
-from emberwatch.common.arguments import as_json
+from emberwatch.common.arguments import as_json, as_moves
 from emberwatch.common.paths import with_absolute_paths
 from emberwatch.envs.observations import Observations
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
 from emberwatch.envs.settings import WorldSpec
-from emberwatch.envs.state import EnvState
 from emberwatch.errors import invalid, repr_of
 from emberwatch.model import Model
+from emberwatch.model.moves import fly
+from emberwatch.render import Palette, Picture, ansi, rgb_array
+from emberwatch.render.screen import Screen
+
+#: Pictures per second in a film, and at most in a window.
+FPS: Final = 10
+
+RENDER_MODES: Final = ("human", "rgb_array", "ansi")
+METADATA: Final[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": FPS}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnvState:
+    """The state of an environment, from `clone_state`; it can be pickled.
+
+    Unpickle only states that you saved: like every pickle, a state can run code.
+    """
+
+    form: str
+    """The class of the environment, and what it observes."""
+    worlds: bytes = field(repr=False)
+    """The worlds and robots, in the format of a snapshot file. They contain the hidden states."""
+    memory: bytes = field(repr=False)
+    """The rest: beliefs, memory of frames, moves of incomplete paths, generators."""
 
 
 class SessionOwner:
-    """The public attributes of an environment or vector environment, taken from its session."""
+    """The robots of a session, one row for each: their frames, pictures and states in memory."""
 
-    _session: Session
-    _observations: Observations | Plans
+    #: The attributes that the future depends on, apart from worlds and observations.
+    _KEPT: ClassVar[tuple[str, ...]]
+
     _made_by: EnvSpec | None = None
+    #: The frames of the current step, `(n_rows, H, W)`.
+    _frames: NDArray[np.uint8]
+    #: The hidden states in each robot's world, `(n_rows, H, W)`; None if they are not read.
+    _truths: NDArray[np.uint8] | None = None
+
+    def _attach(self, session: Session, observations: Observations | Plans, pays: int) -> None:
+        """`pays` is the kind of reward, an index in `base.REWARDS`."""
+        self._session, self._spec = session, session.spec
+        self._observations, self._pays = observations, pays
+        self._reveals = session.settings.truth
+        self._reads_truth = session.settings.reads_truth
+        self.render_mode = mode = session.settings.render_mode
+        if mode is not None and mode not in RENDER_MODES:
+            raise invalid("render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr_of(mode))
+        self._palette = Palette.of(session.spec.described or session.spec.n_observations)
+        self._screen: Screen | None = None
+        #: The cells of each robot's last path; None without a render mode.
+        self._paths: list[NDArray[np.intp] | None] = [None] * session.n_rows
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -48,22 +95,13 @@ class SessionOwner:
         return self._session.spec
 
     @property
-    def n_moves(self) -> int:
-        """Number of moves in a path, T."""
-        return self._session.spec.n_moves
-
-    @property
     def burn_in(self) -> int:
         """Number of steps that the worlds are simulated before k = 0."""
         return self._session.spec.burn_in
 
     @property
     def instance(self) -> str:
-        """The instance name of the server that the environment is attached to, after a reset.
-
-        Raises:
-            InvalidArgumentError: If the worlds are in this process, without `instance`.
-        """
+        """The instance name of the environment's server, after a reset; refused without one."""
         return self._session.instance
 
     @property
@@ -101,7 +139,9 @@ class SessionOwner:
         """
         with self._session.turn:
             worlds = self._session.clone_state()
-            return EnvState.of(self._form(), worlds, self._memory())
+            kept = {name: getattr(self, name) for name in self._KEPT}
+            memory = pickle.dumps((kept, self._observations.memory()))
+            return EnvState(self._form(), worlds, memory)
 
     def restore_state(self, state: EnvState) -> None:
         """Returns to a state of `clone_state`, as often as you like.
@@ -121,19 +161,73 @@ class SessionOwner:
             raise invalid("state", f"a state of {form}", got)
         with self._session.turn:
             answer = self._session.restore_state(state.worlds)
-            self._restore(answer, state.copy_of_memory())
+            kept, memory = pickle.loads(state.memory)
+            vars(self).update(kept)
+            self._restore(answer)
+            self._observations.restore(memory, answer.results)
             self._session.finish()
+
+    def draw(self, rows: slice) -> Any:
+        """Returns a picture of some robots of one world, or shows it, in mode ``"human"``."""
+        frame, cells = self.seen(rows)
+        paths = [self._path(row) for row in range(len(self._paths))[rows]]
+        picture = Picture(
+            frame=frame,
+            palette=self._palette,
+            robots=[(row, col) for row, col in cells.tolist()],
+            paths=[path for path in paths if path is not None],
+            truth=self._truths[rows.start] if self._reveals and self._truths is not None else None,
+            airspace=self._spec.airspace,
+        )
+        if self.render_mode != "human":
+            return rgb_array(picture) if self.render_mode == "rgb_array" else ansi(picture)
+        self._screen = self._screen or Screen(fps=FPS)
+        self._screen.show(picture)
+        return None
+
+    def _close(self) -> None:
+        self._session.close()
+        if self._screen is not None:
+            self._screen.close()
+            self._screen = None
+
+    def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        """Returns the combined frame and the cells of some robots of one world, as new arrays."""
+        return self._frames[rows].min(axis=0), self._robots()[rows]
+
+    def can_draw(self) -> bool:
+        """Returns whether there is something to draw; warns if not."""
+        if self.render_mode is None or not self.is_open:
+            gymnasium.logger.warn(
+                "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
+            )
+            return False
+        return True
+
+    def _keep_paths(
+        self, moved: NDArray[np.bool_], results: NDArray[np.void], paths: ArrayLike
+    ) -> None:
+        """Keeps the cells of the paths that the rows `moved` flew, for pictures."""
+        moves = as_moves(paths, len(results), self._spec.n_moves).reshape(len(results), -1)
+        for row in np.flatnonzero(moved).tolist():
+            robot = results["robot"][row]
+            start = int(robot["start_row"]), int(robot["start_col"])
+            self._paths[row] = fly(start, moves[row, : robot["n_moves"]], self._spec)
+
+    def _path(self, row: int) -> NDArray[np.intp] | None:
+        """Returns the cells of a robot's path, which are kept only with a render mode."""
+        return self._paths[row]
+
+    def _robots(self) -> NDArray[np.int64]:
+        """Returns row and column of each robot as a new array."""
+        raise NotImplementedError
 
     def _form(self) -> str:
         """Names the class and what it observes."""
         return f"{type(self).__name__} with {self._observations.form}"
 
-    def _memory(self) -> dict[str, Any]:
-        """Returns what the future depends on, apart from the worlds."""
-        raise NotImplementedError
-
-    def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
-        """Continues from restored worlds, whose current step is `answer`, and from `_memory`."""
+    def _restore(self, answer: StepAnswer) -> None:
+        """Continues from restored worlds, whose current step is `answer`."""
         raise NotImplementedError
 
     def __getstate__(self) -> dict[str, Any]:

@@ -4,9 +4,8 @@
 # pyright: reportUnknownArgumentType=false
 
 from copy import deepcopy
-from typing import Any, Final, Literal, Unpack
+from typing import Any, Final, Literal
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
@@ -15,14 +14,13 @@ from pettingzoo import ParallelEnv
 
 from emberwatch.client.wire import UNOBSERVED
 from emberwatch.common.arguments import as_array
-from emberwatch.envs.base import NOTHING_TO_DRAW, as_options
+from emberwatch.envs.base import as_options
 from emberwatch.envs.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.envs.observations import MovesParts, names_of, of_row
-from emberwatch.envs.owner import state_of
+from emberwatch.envs.owner import METADATA, state_of
 from emberwatch.envs.path_env import WildfireVectorEnv
-from emberwatch.envs.settings import WorldArguments, shows_keywords
+from emberwatch.envs.settings import shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv, info_of
-from emberwatch.envs.view import RENDER_FPS, RENDER_MODES
 from emberwatch.errors import invalid, repr_of
 
 _ENVIRONMENTS: Final = {"move": WildfireMovesVectorEnv, "path": WildfireVectorEnv}
@@ -63,7 +61,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         max_episode_steps: int | Literal["task"] | None = "task",
         window: int | None = None,
         kind: str = "known",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class. Worlds are created or acquired at the first reset."""
         if action not in _ENVIRONMENTS:
@@ -84,9 +82,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = [f"robot_{row}" for row in range(self._worlds.num_envs)]
         self.agents: list[str] = []
         self.metadata = {
+            **METADATA,
             "name": "emberwatch_wildfire_v0",
-            "render_modes": list(RENDER_MODES),
-            "render_fps": RENDER_FPS,
             "is_parallelizable": True,
         }
         self.render_mode = self._worlds.render_mode
@@ -102,7 +99,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         spec = self._worlds.world_spec
         if max_episode_steps == "task":
             n_paths = _N_PATHS if spec.task is None else spec.task.max_steps
-            self._worlds.end_after(n_paths * (spec.n_moves if action == "move" else 1))
+            n_steps = n_paths * (spec.n_moves if action == "move" else 1)
+            self._worlds.max_episode_steps = n_steps
         #: The space of `state`.
         self.state_space = spaces.Box(
             0, 255, (spec.height, spec.width, spec.n_observations + 2), np.uint8
@@ -138,20 +136,17 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         Raises:
             EmberwatchError: As in `WildfireEnv.step`.
         """
-        with self._worlds.turn:
-            return self._step(actions)
-
-    def _step(self, actions: dict[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
         given: Any = actions
-        if not isinstance(given, dict) or actions.keys() != set(self.agents):
-            raise invalid("actions", f"one for each of {self.agents}", repr_of(actions))
-        if not actions:
-            return {}, {}, {}, {}, {}
-        chosen = as_array([actions[agent] for agent in self.agents], "actions", "all of one shape")
-        seen, rewards, terminated, truncated, infos = self._worlds.step(chosen)
-        if (terminated | truncated).any():
-            self.agents = []
         agents = self.possible_agents
+        with self._worlds.turn:
+            if not isinstance(given, dict) or actions.keys() != set(self.agents):
+                raise invalid("actions", f"one for each of {self.agents}", repr_of(actions))
+            if not actions:
+                return {}, {}, {}, {}, {}
+            chosen = as_array([actions[agent] for agent in agents], "actions", "all of one shape")
+            seen, rewards, terminated, truncated, infos = self._worlds.step(chosen)
+            if (terminated | truncated).any():
+                self.agents = []
         return (
             self._by_agent(seen),
             dict(zip(agents, rewards.tolist(), strict=True)),
@@ -159,16 +154,6 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             dict(zip(agents, truncated.tolist(), strict=True)),
             self._infos(infos),
         )
-
-    def action_masks(self) -> dict[str, NDArray[np.int8]]:
-        """Returns the mask of each agent, as in its info; see `WildfireMovesEnv.action_masks`.
-
-        Available only with `action="move"`, because in a path, where a move leads depends on the
-        moves before it.
-        """
-        if not isinstance(self._worlds, WildfireMovesVectorEnv):
-            raise invalid("action_masks", "an environment with action='move'", "'path'")
-        return dict(zip(self.possible_agents, self._worlds.action_masks(), strict=True))
 
     def state(self) -> NDArray[np.uint8]:
         """Returns the team's last frame and the robots' cells, without the hidden states.
@@ -186,10 +171,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     def render(self) -> Any:
         """Draws the team's last frame, paths and robots."""
-        if self.render_mode is None or not self._worlds.is_open:
-            gymnasium.logger.warn(NOTHING_TO_DRAW)
+        if not self._worlds.can_draw() or self.render_mode == "human":
             return None
-        return None if self.render_mode == "human" else self._worlds.draw(self._all)
+        return self._worlds.draw(self._all)
 
     def close(self) -> None:
         self._worlds.close()

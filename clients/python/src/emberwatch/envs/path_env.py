@@ -1,6 +1,7 @@
 """`emberwatch/Wildfire-v0`: one step flies one path."""
 
-from typing import Unpack
+from dataclasses import replace
+from typing import Any
 
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
@@ -9,8 +10,8 @@ from emberwatch.client import wire
 from emberwatch.envs.base import Reward, WorldEnv, check_reward
 from emberwatch.envs.observations import Observations, Parts, has_memory
 from emberwatch.envs.session import Session
-from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
-from emberwatch.envs.vector_base import WorldVectorEnv, vector_session
+from emberwatch.envs.settings import Settings, shows_keywords
+from emberwatch.envs.vector_base import WorldVectorEnv
 
 
 class WildfireEnv(WorldEnv):
@@ -155,7 +156,7 @@ class WildfireEnv(WorldEnv):
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
         kind: str = "known",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
         session = Session(Settings.of(WildfireEnv, world))
@@ -191,12 +192,14 @@ class WildfireVectorEnv(WorldVectorEnv):
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
         kind: str = "known",
-        **world: Unpack[WorldArguments],
+        **world: Any,
     ) -> None:
         """See the class."""
         pays = check_reward(reward)
         settings = Settings.of(WildfireVectorEnv, world)
-        session = vector_session(settings, num_envs, rebuilds_memory=has_memory(observation))
+        if settings.instance is None and not has_memory(observation):
+            settings = replace(settings, history=1)  # a reset with `resume` needs no earlier frames
+        session = Session(settings, num_envs)
         super().__init__(
             session,
             Observations(observation, session, kind=kind),

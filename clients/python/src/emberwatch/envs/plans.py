@@ -11,7 +11,7 @@ import emberwatch._native as _native
 from emberwatch.client.wire import RobotResult, StepAnswer, StepResult, WorldResult
 from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
@@ -39,10 +39,6 @@ class Plans:
             raise InvalidArgumentError(
                 "robots, robot: expected worlds of one robot, as options are planned for one robot"
             )
-        names: dict[str, object] = {"estimator": estimator or "", "prior": prior}
-        for name, value in names.items():
-            if not isinstance(value, str):
-                raise invalid(name, "a name", repr_of(value))
         self._session = session
         path = None if checkpoint is None else utf8("checkpoint", checkpoint)
         # The bytes, because the file may change or move before a reset makes the beliefs again.
@@ -66,11 +62,9 @@ class Plans:
     def start_episodes(
         self, begun: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
     ) -> None:
-        """Begins or resumes the episodes of the worlds in `begun`.
+        """Begins or resumes the episodes of the worlds in `begun`, as `WildfireObjectiveEnv` tells.
 
-        A resumed world's belief is the one that an agent left for the current step. If no agent
-        left one, the belief is computed from the frames that the server keeps. `results` and
-        `frames` have a row for every world.
+        `results` and `frames` have a row for every world.
         """
         native = self._native = self._native or self._made()
         native.start_episodes(begun, results.view(np.uint8))
@@ -87,10 +81,7 @@ class Plans:
     def update(
         self, moved: NDArray[np.bool_], results: NDArray[np.void], frames: NDArray[np.uint8]
     ) -> None:
-        """Updates the beliefs about the worlds in `moved` with a step, and plans again there.
-
-        `results` and `frames` have a row for every world.
-        """
+        """Updates the beliefs about the worlds in `moved` with a step, and plans again there."""
         assert self._native is not None
         self._native.update(moved, results.view(np.uint8), frames)
         self._plan(moved, results)

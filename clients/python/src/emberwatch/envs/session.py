@@ -7,7 +7,7 @@ and used in a forked child, as in Gymnasium's `AsyncVectorEnv`.
 import threading
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields
 from enum import Enum
 from typing import Final
 
@@ -22,13 +22,12 @@ from emberwatch.client.replies import LeftBelief
 from emberwatch.client.wire import StepAnswer, WorldResult
 from emberwatch.envs.advice import (
     about_barren_worlds,
-    about_forgotten_steps,
     warn,
     warn_of_test_worlds,
     warn_without_rewards,
 )
 from emberwatch.envs.fork_lock import ForkLock
-from emberwatch.envs.settings import Settings, WorldSpec, own_spec, running_spec
+from emberwatch.envs.settings import Settings, own_spec, running_spec
 from emberwatch.errors import (
     EmberwatchError,
     LeaseLostError,
@@ -72,13 +71,11 @@ _UNFINISHED: Final = frozenset((State.BEGUN, State.MOVED, State.TORN, State.TIME
 
 
 class Session:
-    """Consecutive robots under a lease, one row for each. The first reset opens the session.
+    """Consecutive robots under a lease, one row for each: all of some worlds, or one of a world.
 
-    A session flies all robots of its worlds, or one robot of a world that other clients fly in. An
-    environment holds the lock `turn` during each step and reset, as threads may share the
-    environment. It first calls `begin_step` or `begin_reset`, and at the end `finish`. Ctrl-C or a
-    signal handler may interrupt it in between. Then the state stays unfinished, and steps are
-    refused.
+    An environment holds the lock `turn` during each step and reset, as threads may share it. It
+    first calls `begin_step` or `begin_reset`, and at the end `finish`. Ctrl-C or a signal handler
+    may interrupt it in between. Then the state stays unfinished, and steps are refused.
     """
 
     def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
@@ -87,7 +84,7 @@ class Session:
         self._asked_rows = n_rows
         self._client: Client | None = None
         self._lease: Lease | None = None
-        #: The settings of worlds in this process, with the files that they name.
+        #: The settings of worlds in this process.
         self._own: CheckedSettings | None = None
         self._truth: Newest | Present | None = None
         self._has_warned = False
@@ -108,7 +105,7 @@ class Session:
         self.n_rows: Final = len(self._robots)
         self.n_worlds: Final = max(1, self.n_rows // self.spec.n_robots)
         self._worlds: Final = range(settings.world, settings.world + self.n_worlds)
-        if settings.truth and settings.instance and self.n_worlds > wire.TRUTH_BUFFER:
+        if settings.reads_truth and settings.instance and self.n_worlds > wire.TRUTH_BUFFER:
             raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", self.n_worlds)
         warn_without_rewards(self.spec)
 
@@ -122,12 +119,14 @@ class Session:
         """Name of the running server."""
         if self.settings.instance is None:
             raise invalid("instance", "an environment made with instance=...", "one without")
-        return self._opened().client.instance
+        return self.lease.client.instance
 
     @property
     def lease(self) -> Lease:
         """The lease on the session's robots."""
-        return self._opened()
+        if self._lease is None:
+            raise not_reset()
+        return self._lease
 
     @property
     def is_open(self) -> bool:
@@ -140,24 +139,18 @@ class Session:
         return self._state in _UNFINISHED
 
     def begin_step(self) -> None:
-        """Begins a step; refuses it before a reset, or after a call that did not finish."""
         if self._state is not State.READY:
             raise self._no_step()
         self._state = State.BEGUN
 
     def begin_reset(self) -> None:
-        """Begins a reset of all worlds, or of some."""
         self._state = State.TORN if self.is_unfinished else State.BEGUN
 
     def finish(self) -> None:
-        """Ends the step or reset, after the environment has processed its result."""
         self._state = State.READY
 
     def refuse_over(self) -> EmberwatchError:
-        """Returns the error for a shared world whose episode is over.
-
-        Steps raise this error until the next reset.
-        """
+        """Returns the error that steps in a shared world raise after its episode's end."""
         self._state = State.OVER
         return self._no_step()
 
@@ -171,10 +164,9 @@ class Session:
             return self._observe()
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
-        """Begins new episodes in the worlds `indices`; returns the results of all worlds.
+        """Begins episodes in the worlds `indices`, counted from 0; returns all worlds' results.
 
-        `indices` count the session's worlds from 0. If the server has ended, a reset of all worlds
-        connects to a new server of the same instance.
+        If the server has ended, a reset of all worlds connects to a new server of the instance.
         """
         may_move = self.is_open and len(indices) == self.n_worlds
         try:
@@ -202,13 +194,12 @@ class Session:
             return self._observe()
 
     def step(self, paths: ArrayLike, rows: range | None = None) -> StepAnswer:
-        """Flies a path with each robot, or with each of the consecutive robots `rows`.
+        """Flies a path with each robot, or with all robots `rows` of some worlds.
 
-        `rows` includes all robots of some worlds. Waits for slow teammates as long as the server
-        runs. If a shared world moved on without this path, the path is dropped, and the answer has
-        the world's current results.
+        If a shared world moved on without this path, the path is dropped, and the answer has the
+        world's current results.
         """
-        lease = self._opened()
+        lease = self.lease
         robots = None if rows is None else self._robots[rows.start : rows.stop]
         accepts_late, timeout = self._accepts_late, self.settings.timeout
         try:
@@ -252,10 +243,7 @@ class Session:
             raise self._lost(error) from None
 
     def history(self, row: int, step: int) -> Iterator[StepAnswer]:
-        """Yields the earlier steps of a robot's episode, from the first one that is still kept.
-
-        Warns once if that is not the episode's first step.
-        """
+        """Yields the earlier steps of a robot's episode; warns once if the first are not kept."""
         client, robot, past = self._client, self._robots[row], 0
         while client is not None and past < step:
             try:
@@ -270,14 +258,15 @@ class Session:
                 past = error.detail - 1  # earlier steps are gone, perhaps since the last recall
                 if not self._has_warned_of_gap:
                     self._has_warned_of_gap = True
-                    warn(about_forgotten_steps(row, error.detail))
+                    warn(
+                        f"row {row}: joins an episode whose first {error.detail} steps are no "
+                        "longer kept: its belief and its memory of frames begin with the later "
+                        "ones; start the server with a larger --history"
+                    )
             past += 1
 
     def close(self) -> None:
-        """Releases the worlds; the next reset opens the session again.
-
-        May be called several times, also after an interrupted call.
-        """
+        """Releases the worlds; the next reset opens the session again."""
         self._state = State.CLOSED
         lease, self._lease = self._lease, None
         try:
@@ -293,10 +282,7 @@ class Session:
             self._truth = self._client = None
 
     def _open(self, seed: int) -> None:
-        """Opens the worlds, or waits until the server has finished an interrupted call.
-
-        `seed` is the seed of world 0, for worlds in this process.
-        """
+        """Opens the worlds, or waits for an interrupted call. `seed`: of world 0, if it is here."""
         if self.is_open:
             if self._state is State.TORN:
                 with self._classified():
@@ -308,11 +294,11 @@ class Session:
             if settings.instance is None:
                 assert self._own is not None
                 self._client = client = Client.embedded(self._own, seed)
-                self._truth = Present(client.truths) if settings.truth else None
+                self._truth = Present(client.truths) if settings.reads_truth else None
             else:
                 self._client = client = self._connect(settings.instance)
                 self._check_unchanged(client)
-                if settings.truth:
+                if settings.reads_truth:
                     self._truth = Newest(client.instance, self._worlds)
             self._lease = self._acquire(client, settings.takeover)  # sets `is_open`
             self._state = State.MOVED
@@ -330,7 +316,6 @@ class Session:
         )
 
     def _settle(self) -> None:
-        """Waits until the server has finished an interrupted step or reset."""
         client = self._client
         assert client is not None
         # Checks first that the server answers, because the answer to `acquire` may take a whole
@@ -354,7 +339,7 @@ class Session:
         self._warn_of_test_worlds(seeds)
         self._open((seeds[0] - indices[0]) & (2**64 - 1))
         with self._classified():
-            lease = self._opened()
+            lease = self.lease
             lease.reset(seeds, worlds=[self._worlds[index] for index in indices])
             self._state = State.MOVED
             answer = self._observe()
@@ -374,10 +359,7 @@ class Session:
             raise
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
-        """Closes the session after a loss, so that a reset opens it again.
-
-        After a timeout, the session stays open, and only its state changes.
-        """
+        """Closes the session after a loss; after a timeout, it stays open."""
         if isinstance(error, RequestTimeoutError):
             self._state = State.TIMED_OUT
         else:
@@ -391,7 +373,6 @@ class Session:
 
     @contextmanager
     def _classified(self) -> Generator[None]:
-        """Updates the state if a reset or resume raises an error."""
         try:
             yield
         except LOST as error:
@@ -418,27 +399,20 @@ class Session:
             code,
         )
 
-    def _opened(self) -> Lease:
-        if self._lease is None:
-            raise not_reset()
-        return self._lease
-
     def _observe(self) -> StepAnswer:
-        return self._opened().observe(timeout=self.settings.timeout)
+        return self.lease.observe(timeout=self.settings.timeout)
 
     def _check_unchanged(self, client: Client) -> None:
         """Refuses a new server of the instance if its worlds differ from the first server's."""
         spec, _ = running_spec(self.settings, self._asked_rows, client.info)
         if spec != self.spec:
+            names = [each.name for each in fields(spec) if each.compare]
+            others = [name for name in names if getattr(spec, name) != getattr(self.spec, name)]
             raise invalid(
                 f"instance {client.instance!r}",
-                f"the server as it was when the environment was made, {_without_model(self.spec)}",
-                f"{_without_model(spec)} or another model: make the environment again",
+                "the server as it was when the environment was made",
+                f"another {', '.join(others)}: make the environment again",
             )
-
-
-def _without_model(spec: WorldSpec) -> WorldSpec:
-    return replace(spec, model=None, description=None)
 
 
 def not_reset() -> EmberwatchError:

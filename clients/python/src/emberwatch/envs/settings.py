@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from types import NoneType
-from typing import Any, Final, TypedDict, TypeVar, cast, get_args, get_type_hints
+from typing import Any, Final, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 
@@ -37,33 +37,6 @@ _KEYWORDS: Final = {
 _Init = TypeVar("_Init")
 
 
-class WorldArguments(TypedDict, total=False):
-    """The shared keywords and their types."""
-
-    instance: str | None
-    world: int
-    robot: int | None
-    robots: int | None
-    takeover: bool
-    task: str | Path | None
-    model: Model | str | Path | None
-    states: str | Path | None
-    states_symmetries: bool | None
-    states_offset: int | None
-    height: int | None
-    width: int | None
-    n_moves: int | None
-    burn_in: int | None
-    sensor_radius: int | None
-    start: str | None
-    truth: bool
-    timeout: float
-    render_mode: str | None
-
-
-_KINDS: Final[dict[str, Any]] = get_type_hints(WorldArguments)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """The checked values of the keywords that `WildfireEnv` explains."""
@@ -76,17 +49,27 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
+    # Settings of worlds. One that is None is left out: the default, or the server's value.
+    robots: int | None = None
+    model: Model | str | Path | None = None
+    states: str | Path | None = None
+    states_symmetries: bool | None = None
+    states_offset: int | None = None
+    height: int | None = None
+    width: int | None = None
+    n_moves: int | None = None
+    burn_in: int | None = None
+    sensor_radius: int | None = None
+    start: str | None = None
     #: Number of steps whose frames worlds in this process keep; None: the default.
     history: int | None = None
-    #: Whether infos and pictures show the hidden states. Even if False, `truth` may be set, for
-    #: rewards that need the hidden states.
-    reveals: bool = False
-    #: The other keywords, which are settings of worlds. One that is None is left out: the default,
-    #: or the server's value.
-    worlds: dict[str, Any]
+    #: Whether rewards need the hidden states. Only `truth` shows them in infos and pictures.
+    needs_truth: bool = False
 
     @classmethod
-    def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
+    def of(
+        cls, environment: type, world: Mapping[str, Any], *, needs_truth: bool = False
+    ) -> Settings:
         """Makes settings from an environment's shared keywords.
 
         Raises:
@@ -105,31 +88,46 @@ class Settings:
                 f"{repr_of(keyword)}{hint}; known keywords: {', '.join(sorted(known))}"
             )
         given = {keyword: _checked(keyword, value) for keyword, value in world.items()}
-        names = {each.name for each in fields(cls)}
-        own = {keyword: value for keyword, value in given.items() if keyword in names}
-        if not own.get("timeout", STEP_TIMEOUT) > 0:
-            raise invalid("timeout", "seconds above 0", own["timeout"])
-        reveals = own.pop("truth", False)
-        rest = {
-            keyword: value
-            for keyword, value in given.items()
-            if keyword not in names and value is not None
-        }
-        return cls(**own, truth=reveals or needs_truth, reveals=reveals, worlds=rest)
+        settings = cls(**given, needs_truth=needs_truth)
+        if not settings.timeout > 0:
+            raise invalid("timeout", "seconds above 0", settings.timeout)
+        return settings
+
+    @property
+    def reads_truth(self) -> bool:
+        """Whether the hidden states are read."""
+        return self.truth or self.needs_truth
+
+    @property
+    def worlds(self) -> dict[str, Any]:
+        """The settings of worlds that were given."""
+        values = {keyword: getattr(self, keyword) for keyword in OF_WORLDS}
+        return {keyword: value for keyword, value in values.items() if value is not None}
 
     def read(self) -> _native.CheckedSettings:
         """Checks the settings of one world, and reads their files. Errors name keywords."""
         worlds = {"moves" if name == "n_moves" else name: it for name, it in self.worlds.items()}
-        own = {"task": self.task, "publish_truth": self.truth, "history": self.history}
+        own = {"task": self.task, "publish_truth": self.reads_truth, "history": self.history}
         with _names_keywords():
             return read_settings({**own, **worlds})
+
+
+#: The keywords of all environments, with their types.
+KEYWORDS: Final[dict[str, Any]] = {
+    name: kind
+    for name, kind in get_type_hints(Settings).items()
+    if name not in ("history", "needs_truth")
+}
+
+#: The keywords that are settings of worlds: `robots` and those after it.
+OF_WORLDS: Final = tuple(KEYWORDS)[tuple(KEYWORDS).index("robots") :]
 
 
 def _checked(keyword: str, value: Any) -> Any:
     """Returns a keyword's value as a plain Python object; checks its type."""
     if isinstance(value, np.generic):
         value = cast("Any", value.item())
-    kinds = get_args(_KINDS[keyword]) or (_KINDS[keyword],)
+    kinds = get_args(KEYWORDS[keyword]) or (KEYWORDS[keyword],)
     is_kind = isinstance(value, (*kinds, int) if float in kinds else kinds)
     if not is_kind or (isinstance(value, bool) and bool not in kinds):
         names = ("None" if kind is NoneType else kind.__name__ for kind in kinds)
@@ -154,8 +152,8 @@ def shows_keywords(init: _Init) -> _Init:
     own = signature(plain).parameters.values()
     defaults = {each.name: each.default for each in fields(Settings)}
     shared = [
-        Parameter(name, Parameter.KEYWORD_ONLY, default=defaults.get(name), annotation=kind)
-        for name, kind in _KINDS.items()
+        Parameter(name, Parameter.KEYWORD_ONLY, default=defaults[name], annotation=kind)
+        for name, kind in KEYWORDS.items()
     ]
     plain.__signature__ = Signature(
         [*(each for each in own if each.kind is not each.VAR_KEYWORD), *shared]
@@ -165,23 +163,16 @@ def shows_keywords(init: _Init) -> _Init:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldSpec:
-    """The properties of an environment's worlds that are known before the worlds exist."""
+    """What is known of an environment's worlds before they exist; see also `ServerInfo`."""
 
     #: The model; None if a running server hides it, or the worlds are recorded.
     model: Model | None
-    #: Rows of the grid.
     height: int
-    #: Columns of the grid.
     width: int
-    #: Number of moves in a path, T.
     n_moves: int
-    #: Number of observed values, O.
     n_observations: int
-    #: Number of steps that the worlds are simulated before k = 0.
     burn_in: int
-    #: Where robots may fly and what they see.
     airspace: Airspace
-    #: Number of robots in each world.
     n_robots: int
     #: Whether the hidden states come from recorded states instead of a model.
     is_recorded: bool
@@ -201,18 +192,13 @@ class WorldSpec:
         description = info.recorded_states
         if description is not None:
             description = description.with_radius(info.airspace.radius)
+        shared = "height width n_moves n_observations burn_in airspace n_robots".split()
         return cls(
             model=None if info.model is None else Model.from_toml(info.model),
-            height=info.height,
-            width=info.width,
-            n_moves=info.n_moves,
-            n_observations=info.n_observations,
-            burn_in=info.burn_in,
-            airspace=info.airspace,
-            n_robots=info.n_robots,
             is_recorded=info.recorded_world is not None,
             description=description,
             task=task,
+            **{name: getattr(info, name) for name in shared},
         )
 
 
@@ -253,14 +239,8 @@ def running_spec(
     task = built_in_tasks().get(info.task or "")
     if settings.task is not None:
         task = _check_task(settings.task, info)
-    served = {
-        "height": info.height,
-        "width": info.width,
-        "n_moves": info.n_moves,
-        "robots": info.n_robots,
-        "burn_in": info.burn_in,
-        "sensor_radius": info.airspace.radius,
-    }
+    served = {name: getattr(info, name) for name in ("height", "width", "n_moves", "burn_in")}
+    served |= {"robots": info.n_robots, "sensor_radius": info.airspace.radius}
     for keyword, asked in settings.worlds.items():
         if keyword == "model":
             if info.model is not None:
@@ -274,7 +254,7 @@ def running_spec(
     if not 0 <= first <= last < info.n_worlds:
         got = f"{first} to {last}; start the server with --worlds N for more"
         raise invalid("world", f"worlds within 0 to {info.n_worlds - 1}", got)
-    if settings.truth and not info.publish_truth:
+    if settings.reads_truth and not info.publish_truth:
         raise invalid("truth", "a server started with --publish-truth", "one without")
     spec = WorldSpec.of(info, task)
     if "model" in settings.worlds:

@@ -5,7 +5,6 @@ of a world begin and end their episodes together.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -19,20 +18,13 @@ from numpy.typing import NDArray
 from emberwatch._native import columns
 from emberwatch.client.wire import RESULT_DTYPE, StepAnswer
 from emberwatch.common.arguments import as_array, as_integer, as_moves, as_seed
-from emberwatch.envs.base import (
-    NOTHING_TO_DRAW,
-    WorldEnv,
-    as_options,
-    wants_to_resume,
-)
+from emberwatch.envs.base import as_options, wants_to_resume
 from emberwatch.envs.observations import Observations, of_row
-from emberwatch.envs.owner import SessionOwner
+from emberwatch.envs.owner import METADATA, SessionOwner
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session
-from emberwatch.envs.settings import Settings, draw_seed
-from emberwatch.envs.view import View
+from emberwatch.envs.settings import draw_seed
 from emberwatch.errors import invalid, repr_of
-from emberwatch.model.moves import fly
 
 
 class Columns(NamedTuple):
@@ -54,6 +46,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 ):
     """A vector environment of many robots, stepped together."""
 
+    _KEPT = ("_elapsed", "_over", "_has_ended", "_generators", "_paths")
+
     # True until `__init__` ends, because Gymnasium 1.2 also closes an object whose `__init__`
     # failed.
     closed = True
@@ -68,7 +62,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
     ) -> None:
-        """`pays` is the kind of reward, an index in `base.REWARDS`."""
+        if session.settings.robot is not None:
+            raise invalid("robot", "None, as vectors fly all robots", session.settings.robot)
         if max_episode_steps == -1:  # means no limit in `gymnasium.make`
             max_episode_steps = None
         if max_episode_steps is not None:
@@ -76,25 +71,19 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
             if max_episode_steps is None or max_episode_steps < 1:
                 raise invalid("max_episode_steps", "at least 1 or None", repr_of(given))
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self._session, self._spec = session, session.spec
-        spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
-        self._observations = observations
-        self._view = View(mode, spec)
-        self._max_steps = max_episode_steps
-        self._reveals = session.settings.reveals
-        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
-        self.num_envs = num_envs
-        self.render_mode = mode
+        self._attach(session, observations, pays)
+        #: Number of steps after which episodes are truncated; None: never.
+        self.max_episode_steps = max_episode_steps
+        self.metadata = {**METADATA, "autoreset_mode": self.autoreset_mode}
+        self.num_envs = num_envs = session.n_rows
         self.single_observation_space = observations.space
         self.observation_space = batch_space(observations.space, num_envs)
         self.single_action_space = action_space
         self.action_space = batch_space(action_space, num_envs)
         #: The generator of each world's seeds, with its own seed; None before the first reset.
         self._generators: list[tuple[np.random.Generator, int] | None] = [None] * session.n_worlds
-        self._pays = pays
-        self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
+        self._frames = np.zeros((num_envs, self._spec.height, self._spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
-        #: The results as columns.
         self._columns = self._columns_of(self._results)
         self._every = np.ones(num_envs, np.bool_)
         self._none = np.zeros(num_envs, np.bool_)
@@ -102,8 +91,6 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._over, self._has_ended = self._none, False
         #: Mask of the robots that completed a path in the current step; None if no robot did.
         self._exchanged: NDArray[np.bool_] | None = None
-        self._truths: NDArray[np.uint8] | None = None
-        self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
 
     def reset(
@@ -126,17 +113,13 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         seeds = self._check_seeds(seed)
         resumes = wants_to_resume(rest, seed)
         with self._session.turn:
-            if not mask.all() and not self.is_open:
+            was_ready = self.is_open and not self._session.is_unfinished
+            if not mask.all() and not was_ready:
                 raise gymnasium.error.ResetNeeded(
-                    "reset_mask: expected all worlds in the first reset, got some"
-                )
-            if not mask.all() and self._session.is_unfinished:
-                raise gymnasium.error.ResetNeeded(
-                    "reset_mask: expected all worlds, as an earlier step or reset did not finish, "
-                    "got some"
+                    "reset_mask: expected all worlds in the first reset, or after a step or reset "
+                    "that did not finish, got some"
                 )
             self.closed = False
-            was_ready = self.is_open and not self._session.is_unfinished
             self._session.begin_reset()
             chosen = np.flatnonzero(mask).tolist()
             if resumes:
@@ -182,52 +165,27 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns a picture for each robot, as `WildfireEnv.render` draws it."""
-        if self.render_mode is None or not self.is_open:
-            gymnasium.logger.warn(NOTHING_TO_DRAW)
+        if not self.can_draw():
             return None
         if self.render_mode == "human":
             return (None,) * self.num_envs
         return tuple(self.draw(slice(row, row + 1)) for row in range(self.num_envs))
 
-    def draw(self, rows: slice) -> Any:
-        """Draws some robots of one world, and their combined frame."""
-        row: int = rows.start
-        frame, cells = self.seen(rows)
-        robots = [(at[0], at[1]) for at in cells.tolist()]
-        paths = [path for path in map(self._path, range(self.num_envs)[rows]) if path is not None]
-        truth = self._truths[row] if self._truths is not None and self._reveals else None
-        return self._view.draw(frame, robots, paths, truth)
-
-    def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Returns the combined frame and the cells of some robots of one world, as new arrays."""
-        return self._frames[rows].min(axis=0), self._robots()[rows]
-
     @property
     def results(self) -> NDArray[np.void]:
-        """The last result of each robot and its world, `(num_envs,)` of `wire.RESULT_DTYPE`.
-
-        For reports, not for learners.
-        """
+        """The last result of each robot and its world, `(num_envs,)` of `wire.RESULT_DTYPE`."""
         return self._results.copy()
 
     @property
     def truths(self) -> NDArray[np.uint8] | None:
-        """The hidden states of each robot's world, `(num_envs, H, W)`; None if they are not read.
-
-        For reports, not for learners. Do not write to the array.
-        """
+        """The hidden states of each robot's world, `(num_envs, H, W)`. Do not write to them."""
         return self._truths
 
-    def end_after(self, max_episode_steps: int | None) -> None:
-        """Replaces the number of steps after which episodes are truncated; None: never."""
-        self._max_steps = max_episode_steps
-
     def close_extras(self, **kwargs: Any) -> None:
-        self._session.close()
-        self._view.close()
+        self._close()
 
     def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[Any]:
-        """Returns checked actions. If all robots fly, the session checks their paths."""
+        # If all robots fly, the session checks their paths.
         if not self._has_ended:
             return actions
         return as_moves(actions, self.num_envs, self._spec.n_moves)
@@ -241,33 +199,15 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         """Is called after episodes in the rows `begun` have begun or have been resumed."""
 
     def _robots(self) -> NDArray[np.int64]:
-        """Returns row and column of each robot as a new array."""
         return self._columns.cells.copy()
 
-    def _path(self, row: int) -> NDArray[np.intp] | None:
-        """Returns the cells of a robot's last path, which are kept only with a render mode."""
-        return self._paths[row]
-
     def _form(self) -> str:
-        mode, steps = self.autoreset_mode.value, self._max_steps
+        mode, steps = self.autoreset_mode.value, self.max_episode_steps
         return f"{super()._form()}, max_episode_steps={steps}, autoreset_mode={mode}"
 
-    def _memory(self) -> dict[str, Any]:
-        return {
-            "elapsed": self._elapsed,
-            "over": self._over,
-            "generators": self._generators,
-            "paths": self._paths,
-            "observations": self._observations.memory(),
-        }
-
-    def _restore(self, answer: StepAnswer, memory: dict[str, Any]) -> None:
+    def _restore(self, answer: StepAnswer) -> None:
         self._take(answer)
-        self._elapsed, self._over = memory["elapsed"], memory["over"]
-        self._has_ended = bool(self._over.any())
-        self._generators, self._paths = memory["generators"], memory["paths"]
         self._begin(self._every)
-        self._observations.restore(memory["observations"], self._results)
 
     def _exchange(self, paths: NDArray[Any], moved: NDArray[np.bool_]) -> None:
         """Flies complete paths in the rows `moved`, with one message for each run of rows."""
@@ -276,24 +216,17 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         elif moved.any():
             self._frames = self._frames.copy()  # the learner holds the previous array
             for run in _runs(moved):
-                self._exchange_run(paths, run)
+                rows = slice(run.start, run.stop)
+                answer = self._session.step(paths[rows], run)
+                self._frames[rows], self._results[rows] = answer.frames, answer.results
+                if self._truths is not None:
+                    self._truths[rows] = self._session.truth(answer)
+            self._columns = self._columns_of(self._results)
         self._exchanged = moved
         if self._observations.has_memory:
             self._observations.update(moved, self._results, self._frames)
         if self.render_mode is not None:
-            flown = as_moves(paths, self.num_envs, self._spec.n_moves)
-            for row in np.flatnonzero(moved).tolist():
-                robot = self._results["robot"][row]
-                start = int(robot["start_row"]), int(robot["start_col"])
-                self._paths[row] = fly(start, flown[row], self._spec)
-
-    def _exchange_run(self, paths: NDArray[Any], run: range) -> None:
-        chosen = slice(run.start, run.stop)
-        answer = self._session.step(paths[chosen], run)
-        self._frames[chosen], self._results[chosen] = answer.frames, answer.results
-        self._columns = self._columns_of(self._results)
-        if self._truths is not None:
-            self._truths[chosen] = self._session.truth(answer)
+            self._keep_paths(moved, self._results, paths)
 
     def _restart(self, rows: list[int], seeds: Sequence[int | None]) -> None:
         """Begins episodes in the worlds of some rows; `seeds` has an entry for every world."""
@@ -322,10 +255,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return tuple(self._generator(world, None)[1] for world in worlds.tolist())
 
     def _reset_episodes(self, rows: list[int], moved: NDArray[np.bool_]) -> None:
-        """Begins or resumes the episodes of some rows.
-
-        In rows that have not `moved` since the last step, the robots' paths and memory continue.
-        """
+        # In rows that have not moved since the last step, the robots' paths and memory continue.
         self._elapsed[rows] = 0
         self._over = self._over.copy()
         self._over[rows] = False
@@ -341,7 +271,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     def _take(self, answer: StepAnswer) -> None:
         self._frames, self._results = answer.frames, answer.results
         self._columns = self._columns_of(self._results)
-        if self._session.settings.truth:
+        if self._reads_truth:
             self._truths = self._session.truth(answer)
 
     def _columns_of(self, results: NDArray[np.void]) -> Columns:
@@ -355,8 +285,8 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         if self._exchanged is not None and self._columns.is_over:
             terminations |= self._exchanged & self._columns.terminated
             truncations |= self._exchanged & self._columns.truncated
-        if self._max_steps is not None:
-            truncations |= flown & (self._elapsed >= self._max_steps)
+        if self.max_episode_steps is not None:
+            truncations |= flown & (self._elapsed >= self.max_episode_steps)
         over = terminations | truncations
         has_ended = np.count_nonzero(over) > 0
         infos: dict[str, Any] = {}
@@ -413,7 +343,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         return self._observations.all(self._shown(), self._robots())
 
     def _shown(self) -> NDArray[np.uint8]:
-        """Returns frames for the learner, copied if pictures need the originals."""
+        # Pictures need the originals, to which learners may write.
         return self._frames if self.render_mode is None else self._frames.copy()
 
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
@@ -452,21 +382,6 @@ def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
         name: value.item() if isinstance(value, np.generic) else value
         for name, value in shown.items()
     }
-
-
-def vector_session(
-    settings: Settings, num_envs: int | None, *, rebuilds_memory: bool = True
-) -> Session:
-    """Makes a session of all robots of some worlds.
-
-    `rebuilds_memory`: whether a reset with `resume` needs earlier frames. Otherwise, worlds in this
-    process keep only the last frame.
-    """
-    if settings.robot is not None:
-        raise invalid("robot", "None, as a vector environment flies all robots", settings.robot)
-    if settings.instance is None and not rebuilds_memory:
-        settings = replace(settings, history=1)
-    return Session(settings, num_envs)
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[range]:
