@@ -64,7 +64,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
         let second = second.finish();
         second.check_says(FIRST_BELIEF);
         second.check_says("the frames that the server keeps");
-        // The second agent was told to stop. It leaves its belief, and releases its robot.
+        // The second agent, when a signal ends it, leaves its belief, and releases its robot.
         let third = run(&server, &format!("{policy} --steps 20")).ends(0);
         third.check_says("the belief was taken over from the former agent");
         assert!(!third.stderr.contains(FIRST_BELIEF), "{}", third.stderr);

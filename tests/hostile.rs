@@ -8,7 +8,7 @@ use emberwatch_protocol::control::MAX_CONTROL_BYTES;
 use emberwatch_protocol::message::{Status, StepRequest};
 use emberwatch_protocol::observer::Observer;
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tests::fuzz::TARGETS;
 use tests::harness::{ENDLESS, PATIENCE, Server, eventually, new_instance};
 use tests::siege::{FLAGS, besiege};
@@ -202,14 +202,32 @@ fn messages_of_any_length_get_short_replies() {
             let refused = wire.status_of(second_robot(lease), text.as_bytes());
             assert_eq!(refused, (Status::WrongLength, 8 + 6));
         }
-        let files = TARGETS
-            .iter()
-            .flat_map(|target| target.corpus().expect("its corpus"));
-        let ends_server = |file: &[u8]| file.ends_with(br#"{"op":"shutdown"}"#);
-        for file in files.filter(|file| !ends_server(file)) {
-            wire.control(control_header(1), &file);
-            let refused = wire.status_of(second_robot(lease), &file);
-            assert_eq!(refused, (Status::WrongLength, 8 + 6));
+        throw_corpus(&wire, lease);
+    });
+}
+
+/// Sends each file that the fuzz targets begin with, as a control message and as a step's payload.
+fn throw_corpus(wire: &Wire, lease: u64) {
+    let files = TARGETS
+        .iter()
+        .flat_map(|target| target.corpus().expect("its corpus"));
+    let ends_server = |file: &[u8]| file.ends_with(br#"{"op":"shutdown"}"#);
+    for file in files.filter(|file| !ends_server(file)) {
+        wire.control(control_header(1), &file);
+        let refused = wire.status_of(second_robot(lease), &file);
+        assert_eq!(refused, (Status::WrongLength, 8 + 6));
+    }
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn a_server_survives_the_corpus_for_a_minute() {
+    besiege(|server| {
+        let wire = Wire::open(&server.instance);
+        let lease = wire.acquire(1..2).lease;
+        let begin = Instant::now();
+        while begin.elapsed() < Duration::from_secs(60) {
+            throw_corpus(&wire, lease);
         }
     });
 }

@@ -23,7 +23,7 @@ fn start(name: &str, arguments: &str, stdout: Stdio, stderr: impl Into<Stdio>) -
     let mut command = Command::new(program_path(name));
     command
         .args(arguments.split_whitespace())
-        .env("RUST_LOG", "debug");
+        .env("RUST_LOG", "info,emberwatch_server::server::state=debug");
     command.stdin(Stdio::null()).stdout(stdout).stderr(stderr);
     command.spawn().expect("start the program")
 }

@@ -234,7 +234,7 @@ pub fn python() -> PathBuf {
     python
 }
 
-/// Returns the path of a program, which `cargo build --workspace` makes beside the tests.
+/// Returns the path of a program, which `cargo build --workspace` makes in the folder above the tests.
 pub fn program_path(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("this program's path");
     let path = test

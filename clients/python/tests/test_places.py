@@ -40,7 +40,7 @@ def test_a_lock_wait_ends_by_timeout_or_ctrl_c() -> None:
         with fails("channel", match=f"the lock within .*, but it is still held by pid {US}"):
             connect(started.instance, timeout=0.01)
         with ctrl_c():
-            connect(started.instance)
+            connect(started.instance, timeout=PATIENCE)
     started.connect().status()
 
 
