@@ -114,7 +114,7 @@ def test_classes_of_fuel_have_their_factors(tmp_path: Path) -> None:
     model = made(tmp_path, *flags)
     assert model["transitions"][0]["times"] == ["fuel"]
     assert maps(tmp_path)["fuel"].tolist() == [[2.5, 2.5, 1], [0, 2.5, 0]]
-    no_fly = Model.named(tmp_path / "new" / "land.toml").no_fly
+    no_fly = Model.named(tmp_path / "new" / "land.toml").airspace.no_fly
     assert no_fly is not None and no_fly.tolist() == [[0, 0, 1], [0, 0, 1]], "no value: free"
     dem = array(tmp_path / "z.npy", [[0.0, 10.0, 20.0]] * 2)
     made(tmp_path, dem, "--cell=30", *flags)

@@ -18,7 +18,8 @@ from emberwatch.model import Model
 from emberwatch.model.airspace import Airspace
 
 #: A recording of protocol version 2: one world, 12 hidden states and 10 frames.
-GOOD = (Path(__file__).parents[3] / "tests/data/version-2.recording").read_bytes()
+OLD = Path(__file__).parents[3] / "tests/data/version-2.recording"
+GOOD = OLD.read_bytes()
 
 
 def parts() -> list[bytes]:
