@@ -14,6 +14,7 @@ const WRONG_SERVER_FLAGS: &str = r#"
 --instance a/b => instance name | "a/b"
 --worlds 1025 => '1025' | --worlds | expected 1 to 1024
 --worlds 1024 --robots 5 => worlds times robots: expected 1 to 4096, got 5120
+--worlds 1024 --height 4096 --width 4096 => memory: expected | MiB for 1024 worlds of 4096 x 4096 cells | got
 --robots 64 --height 1000 --width 1000 => cells times robots: expected | got 64000000
 --start 3,64 => start: expected a cell on the 64 x 64 grid, got (3, 64)
 --exit-with 0 => --exit-with 0: expected a running process

@@ -96,6 +96,8 @@ fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
         assert_eq!(of(1, team), expected);
         assert_eq!(fires(&of(3, team)), fires(&alone));
     }
+    let rewards = |team| Vec::from_iter(of(3, team).iter().map(|run| run.mean_reward));
+    assert_ne!(rewards("shared"), rewards("alone"));
     let distinct = |team| -> f64 {
         let cells = of(3, team).into_iter().map(|run| run.mean_distinct_cells);
         cells.sum()

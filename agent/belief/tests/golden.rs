@@ -72,13 +72,23 @@ fn the_filter_reproduces_posterior_and_predictor() {
 /// learned. Its weights have shape `[O, S]`, and the softmax is over observations.
 #[test]
 fn the_masked_posterior_agrees() {
-    let mut golden = Golden::open("a4_masked_small");
-    for case in ["3x3", "4x6"] {
-        let weights: Array2<f32> = golden.get(&format!("{case}_W"));
-        let prior: Array3<f32> = golden.get(&format!("{case}_u"));
-        let observations: Array2<u8> = golden.get(&format!("{case}_obs"));
-        let mask: Array2<u8> = golden.get(&format!("{case}_mask"));
-        let posterior: Array3<f32> = golden.get(&format!("{case}_state_est"));
+    let mut small = Golden::open("a4_masked_small");
+    let mut cases = Vec::from(["3x3", "4x6"].map(|case| {
+        let weights: Array2<f32> = small.get(&format!("{case}_W"));
+        let prior: Array3<f32> = small.get(&format!("{case}_u"));
+        let observations: Array2<u8> = small.get(&format!("{case}_obs"));
+        let mask: Array2<u8> = small.get(&format!("{case}_mask"));
+        let posterior: Array3<f32> = small.get(&format!("{case}_state_est"));
+        (case, weights, prior, observations, mask, posterior)
+    }));
+    let mut large = Golden::open("../../../network/tests/data/a4_masked_step");
+    let first = |steps: Array3<u8>| steps.index_axis_move(Axis(0), 0);
+    let (observations, mask) = (first(large.get("obs")), first(large.get("mask")));
+    let posteriors: Array4<f32> = large.get("state_est");
+    let posterior = posteriors.index_axis_move(Axis(0), 0);
+    let (weights, prior) = (large.get("W_obs_param"), large.get("u0"));
+    cases.push(("64x64", weights, prior, observations, mask, posterior));
+    for (case, weights, prior, observations, mask, posterior) in cases {
         let mut file = Model::wildfire().file().clone();
         for (state, column) in file.states.iter_mut().zip(weights.columns()) {
             let exponentials = column.mapv(|w| f64::from(w).exp());

@@ -100,6 +100,7 @@ def netcdf(
     times: Sequence[float] | None = None,
     time_unit: str = "",
     over: Sequence[str] = ("time", "y", "x"),
+    scale: float = 1,
     **coordinates: Any,
 ) -> Path:
     """Writes a variable `v` with coordinates, `y` and `x` in metres unless others are given."""
@@ -109,6 +110,8 @@ def netcdf(
         coordinates["time"] = "time", np.array(times, "f8"), {"units": time_unit}
     array = xarray.DataArray(values, coordinates, over[-values.ndim :], attrs={"units": unit})
     encoding = {"_FillValue": NEVER} if values.dtype.kind == "f" else {}
+    if scale != 1:
+        array.attrs["scale_factor"] = scale
     array.to_dataset(name="v").to_netcdf(path, encoding={"v": encoding})
     return path
 

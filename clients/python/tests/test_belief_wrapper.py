@@ -13,13 +13,12 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from emberwatch.belief import RECOMMENDED, initial_prior, known, uniform_prior
-from emberwatch.belief.prior import prior_of
+from emberwatch.belief.prior import simulated_prior
 from emberwatch.model import Model
 from emberwatch.wrappers import BeliefObservation
 
 WILDFIRE = Model.wildfire()
 SHAPE = (4, 6)
-NAMES = ("initial", "uniform", "simulated")
 GRID = {"height": 4, "width": 6}
 
 
@@ -129,8 +128,14 @@ def test_a_spec_makes_the_same_environment(tmp_path: Path, monkeypatch: pytest.M
 
 def test_priors_are_given_by_name_or_array() -> None:
     given = np.moveaxis(np.random.default_rng(0).dirichlet(np.ones(3), SHAPE), -1, 0)
-    rows = [(prior, prior_of(prior, WILDFIRE, **GRID, burn_in=50)) for prior in NAMES]
-    for prior, expected in (*rows, (given, given), (None, dict(rows)["simulated"])):
+    simulated = simulated_prior(WILDFIRE, **GRID, burn_in=50)
+    for prior, expected in (
+        ("initial", initial_prior(WILDFIRE, **GRID)),
+        ("uniform", uniform_prior(WILDFIRE, **GRID)),
+        ("simulated", simulated),
+        (None, simulated),
+        (given, given),
+    ):
         observation, _ = BeliefObservation(Stub(burn_in=50), prior=prior).reset()
         np.testing.assert_allclose(observation, expected, rtol=0, atol=1e-6)
     for prior, expected in (("flat", "got 'flat'"), (given[:, :, 1:], "got .3, 4, 5.")):

@@ -40,6 +40,13 @@ def test_paths_may_be_integers_of_any_type() -> None:
         assert lease.step(moves).result(1).world.step == k
 
 
+def test_a_lease_names_its_robots_and_worlds() -> None:
+    with emberwatch.embed(height=4, width=6, moves=4, burn_in=0, worlds=3, robots=2) as client:
+        lease = client.acquire(2, 4)
+        assert (lease.robots, lease.worlds) == (range(2, 6), range(1, 3))
+        assert [world.step for world in lease.start] == [0, 0]
+
+
 def test_an_answer_leaves_no_memory_behind() -> None:
     with emberwatch.embed(height=16, width=20, moves=4, burn_in=0) as client:
         lease = client.acquire()

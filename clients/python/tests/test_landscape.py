@@ -57,6 +57,7 @@ def same_arrivals(f: Path) -> list[tuple[object, ...]]:
         (ascii_grid(f / "oblong.asc", side="dx 30\ndy 40"), *minutes, "--oblong"),
         (netcdf(f / "fire.nc"),),
         (netcdf(f / "hours.nc", with_never(NEVER, 1 / 60), "hours"),),
+        (netcdf(f / "packed.nc", with_never(NEVER, 8), scale=0.125),),
         (netcdf(f / "dates.nc", with_never(np.nan), "minutes since 2020-08-01"),),
         (f / "fire.npy", *minutes),
         (f / "fire.npz", *minutes, "--variable", "fire"),

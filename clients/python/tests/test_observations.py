@@ -21,11 +21,29 @@ from environments import (
 from failures import refuses
 
 from emberwatch.belief import known
+from emberwatch.envs.last_seen import LastSeen
 from emberwatch.envs.observations import Observations
 from emberwatch.wrappers import BeliefObservation
 
-#: The smallest grid that the parts are meant for.
-SMALL: dict[str, Any] = {"height": 12, "width": 12, "n_moves": 6, "model": "wildfire-small"}
+
+def test_an_image_is_the_frame_one_hot() -> None:
+    for seen in [step[0] for step in rollout(make(observation=("frame", "image")), 9, seed=4)]:
+        frame = seen["frame"][..., 0]
+        assert np.array_equal(seen["image"], 255 * np.eye(4)[np.where(frame == 255, 3, frame)])
+
+
+def test_strengths_halve_in_16_steps_and_ages_stop_at_255() -> None:
+    row, frame = np.array([True]), np.array([[[2, 255]]], np.uint8)
+    seen = LastSeen(1, 1, 2, 3)
+    seen.reset(row, frame)
+    strengths = [seen.fading(row)[0, 0].tolist()]
+    for _ in range(300):
+        seen.update(row, np.full_like(frame, 255))
+        strengths.append(seen.fading(row)[0, 0].tolist())
+    assert [strengths[age] for age in (0, 16, 32)] == [
+        [[0, 0, n], [0, 0, 0]] for n in (255, 128, 64)
+    ]
+    assert seen.ages.tolist() == [[[255, 255]]]
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])

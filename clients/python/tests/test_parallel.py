@@ -117,6 +117,24 @@ def test_an_agent_may_write_to_its_observation() -> None:
         assert (env.state() == state).all()
 
 
+def test_the_state_shows_the_teams_frame_and_cells() -> None:
+    env = team(action="path", observation=("frame", "robot"))
+    env.reset(seed=3)
+    for action in random_actions(5, 4, (4,)):
+        seen, *_ = env.step(action)
+        state = env.state()
+        assert env.state_space.contains(state)
+        frame = np.min([one["frame"] for one in seen.values()], axis=0)[..., 0]
+        seen["robot_0"]["frame"][:] = 7  # the agent may write to it
+        assert (env.state() == state).all()
+        values = np.where(frame == 255, state.shape[2] - 2, frame)
+        assert (state[..., :-1].argmax(axis=2) == values).all()
+        assert (state[..., :-1].sum(axis=2, dtype=int) == 255).all()
+        places = np.zeros_like(frame)
+        places[tuple(np.array([one["robot"] for one in seen.values()]).T)] = 255
+        assert (state[..., -1] == places).all()
+
+
 def test_a_team_is_drawn_as_a_whole() -> None:
     env = team(render_mode="rgb_array", start="centre")
     with pytest.warns(UserWarning, match="nothing to draw"):

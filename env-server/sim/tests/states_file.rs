@@ -236,6 +236,13 @@ fn broken_archives_are_refused_each_by_its_problem() {
         let error = read("lab.npz", &bytes).expect_err(words);
         assert!(error.contains(words), "{error:?} does not say {words:?}");
     }
+    for (name, good) in [("lab.npz", &deflated), ("lab.npy", &whole)] {
+        for at in 0..good.len() {
+            let mut changed = good.clone();
+            changed[at] ^= 0x81;
+            let _ = read(name, &changed); // any result, but no panic
+        }
+    }
     let error = read("lab.tif", &whole).expect_err("another ending");
     let words = "expected a .npz or .npy file, or a folder of these, got \"lab.tif\"";
     assert!(error.contains(words), "{error}");

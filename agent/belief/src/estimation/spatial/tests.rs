@@ -67,9 +67,10 @@ fn an_impossible_frame_changes_nothing_with_or_without_spread() {
     // The observation of cell 0 is possible. The observation of cell 2 is not: the cell is certainly normal, and this
     // model never shows a normal cell as fire.
     let frame = Frame::from_bytes(shape(2, 2), 3, &[2, 255, 2, 2]).expect("a frame");
-    let filter = BayesFilter::known(&model, prior, false).expect("valid");
-    for neighbours in [None, Some((FIRE, Correlations::default()))] {
-        let mut filter = correcting(filter.clone(), neighbours);
+    let with = |cavities| BayesFilter::known(&model, prior.clone(), cavities).expect("valid");
+    let neighbours = Some((FIRE, Correlations::default()));
+    for (cavities, neighbours) in [(false, None), (true, None), (false, neighbours)] {
+        let mut filter = correcting(with(cavities), neighbours);
         let before = filter.to_bytes();
         let Err(EstimatorError::ZeroEvidence(error)) = filter.correct(&frame) else {
             panic!("expected a normal cell seen as fire");
