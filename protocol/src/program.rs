@@ -35,6 +35,9 @@ pub fn parse_flags<T: Parser>() -> T {
 }
 
 /// Prints a text to standard output. A reader that has closed its end, as `head` does, is no error: it needs no more.
+///
+/// # Errors
+/// If the text cannot be written for another reason.
 pub fn print(text: &str) -> std::io::Result<()> {
     let mut out = std::io::stdout();
     let printed = out.write_all(text.as_bytes()).and_then(|()| out.flush());
@@ -49,6 +52,9 @@ pub fn print(text: &str) -> std::io::Result<()> {
 
 /// Returns a flag that SIGINT, SIGTERM or SIGHUP sets. A second signal ends the process at once. `timeout` and shells
 /// send one signal to a process and to its group, so signals within half a second of the first count as the same one.
+///
+/// # Errors
+/// If the system does not allow a handler or a thread.
 pub fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();

@@ -44,7 +44,10 @@ pub fn named(name: &str) -> Option<&'static BeliefKind> {
     BELIEFS.iter().copied().find(|kind| kind.name == name)
 }
 
-/// Finds a kind of belief on which a DQN can learn to choose options. The error lists the names of all valid kinds.
+/// Finds a kind like [`named`], but only among the kinds of belief on which a DQN can learn to choose options.
+///
+/// # Errors
+/// If there is no such kind. The error lists the names of all valid kinds.
 pub fn of_options(name: &str) -> Result<&'static BeliefKind, String> {
     named(name).filter(|kind| kind.has_options).ok_or_else(|| {
         let kinds = BELIEFS.iter().filter(|kind| kind.has_options);

@@ -81,7 +81,10 @@ impl AgentConfig {
         Self::from_toml(PAPER).expect("invariant: the preset has valid settings")
     }
 
-    /// Parses settings from TOML; others keep their defaults. An error names the first unknown or invalid setting.
+    /// Parses settings from TOML. Settings that the text omits keep their defaults.
+    ///
+    /// # Errors
+    /// If a setting is unknown or out of range. The error names the first such setting.
     pub fn from_toml(text: &str) -> Result<Self> {
         let mut settings: Table = DEFAULTS.parse()?;
         let given: Table = text
@@ -93,7 +96,10 @@ impl AgentConfig {
         Ok(config)
     }
 
-    /// Checks every setting. An error names the first that is out of range.
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// If a setting is out of range. The error names the first such setting.
     pub fn check(&self) -> Result<()> {
         let ranges = [
             ("beam_width", self.beam_width as f64, 1.0, 1e4),

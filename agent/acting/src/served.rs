@@ -18,7 +18,10 @@ impl<'a, B: Backend> Served<'a, B> {
         Self { client, shows_all }
     }
 
-    /// Returns the current observation of each agent, or an error if the backend does not answer.
+    /// Returns the current observation of each agent.
+    ///
+    /// # Errors
+    /// If the backend does not answer.
     pub fn observe(&mut self) -> Result<Vec<AgentObservation>> {
         let observations = self.client.observe(self.client.robots())?;
         let seen = observations.into_iter();

@@ -100,7 +100,10 @@ impl Contents {
         Ok(state)
     }
 
-    /// Returns a tensor's values, or an error if it is missing, has another shape, or is not finite.
+    /// Returns the values of a tensor.
+    ///
+    /// # Errors
+    /// If the tensor is missing, has a different shape, or contains non-finite values.
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
         let tensor = self.tensors.get(name);
         let tensor = tensor.with_context(|| {
@@ -184,7 +187,10 @@ impl Part<'_> {
     }
 }
 
-/// Writes a checkpoint of a kind of learner. After an error, an existing file is unchanged.
+/// Writes a checkpoint for a kind of learner, completely or not at all.
+///
+/// # Errors
+/// If the system reports an error. An existing file then remains unchanged.
 pub fn write(path: &Path, kind: &str, contents: &Contents) -> Result<()> {
     let bytes = encode(kind, contents).with_context(|| named(path))?;
     replace_file(path, &bytes).with_context(|| named(path))

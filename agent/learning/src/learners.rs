@@ -31,7 +31,10 @@ pub const LEARNERS: &[&LearnerKind] = &[
     &decisions::DECISIONS,
 ];
 
-/// Finds a kind of learner by its name. The error lists all names.
+/// Finds a kind of learner by its name.
+///
+/// # Errors
+/// If there is no such learner. The error lists the names of all learners.
 pub fn named(name: &str) -> Result<&'static LearnerKind, String> {
     let found = LEARNERS.iter().copied().find(|kind| kind.name == name);
     found.ok_or_else(|| {

@@ -116,6 +116,9 @@ pub fn filter_tensors(model: &LearnedModel) -> [NamedTensor; 3] {
 }
 
 /// Returns the parameters of a network, and of the filter that it corrects, as named tensors.
+///
+/// # Errors
+/// If the network's device fails.
 pub fn neural_tensors(model: &NeuralModel) -> Result<Vec<NamedTensor>, NetworkError> {
     let filter = model.filter.as_deref().map(corrected_tensors);
     let parameters = model.network.parameters()?.into_iter();

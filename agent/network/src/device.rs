@@ -5,7 +5,10 @@ use candle_core::{Device, Result as CandleResult};
 /// The names of devices: the CPU, with our operators, and the first NVIDIA and Apple GPU, with candle's operators.
 pub const DEVICES: [&str; 3] = ["cpu", "cuda", "metal"];
 
-/// Opens a device by its name in [`DEVICES`], if this program has support for it.
+/// Opens a device by its name in [`DEVICES`].
+///
+/// # Errors
+/// If this program has no support for the device, or the device cannot be opened.
 pub fn open_device(name: &str) -> Result<Device, String> {
     let (is_built, device): (_, fn(usize) -> CandleResult<Device>) = match name {
         "cuda" => (cfg!(feature = "cuda"), Device::new_cuda),

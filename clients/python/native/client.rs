@@ -242,7 +242,10 @@ impl Client {
         stopped.map(drop)
     }
 
-    /// Returns the hidden states of worlds in this process with `publish_truth`, one `Truth` each.
+    /// Returns the hidden states of worlds in this process, one `Truth` for each world.
+    ///
+    /// Raises:
+    ///     InvalidArgumentError: Unless these worlds are in this process, with `publish_truth`.
     fn truths<'py>(
         &self,
         py: Python<'py>,
@@ -257,6 +260,9 @@ impl Client {
     }
 
     /// Returns the state of all worlds in this process, as bytes of a snapshot.
+    ///
+    /// Raises:
+    ///     InvalidArgumentError: If the worlds are on a server; see `snapshot`.
     fn clone_state(&self, py: Python<'_>) -> PyResult<Cow<'static, [u8]>> {
         let clone = |backend: &mut dyn Backend| backend.clone_state();
         self.ask(py, "clone_state", 0.0, clone).map(Cow::from)
@@ -264,8 +270,11 @@ impl Client {
 
     /// Replaces all worlds in this process with the worlds that `clone_state` returned.
     ///
-    /// Then call `Lease.observe`: the next paths start from the steps that it returns. If the bytes
-    /// are damaged or of other worlds, no world changes.
+    /// Then call `Lease.observe`: the next paths start from the steps that it returns.
+    ///
+    /// Raises:
+    ///     InvalidArgumentError: If the bytes are damaged or of other worlds, or the worlds are on
+    ///         a server. No world has changed then.
     fn restore_state(&self, py: Python<'_>, worlds: Cow<'_, [u8]>) -> PyResult<()> {
         let restore = |backend: &mut dyn Backend| backend.restore_state(&worlds);
         self.ask(py, "restore_state", 0.0, restore)

@@ -68,8 +68,10 @@ impl Lease {
     ///     team: Whether to return one frame for each world's team instead of one for each robot.
     ///
     /// Raises:
+    ///     InvalidArgumentError: If the paths do not have this shape, type and range.
     ///     LeaseLostError: If the lease expired or a robot was taken over.
     ///     RequestTimeoutError: If no answer arrives; `observe` shows whether the step was made.
+    ///     ServerGoneError: If the server ended.
     ///     EmberwatchError: With code `"late"` if the world moved on without this path; `observe`
     ///         shows to which step. With code `"episode_over"` if the episode has ended: reset that
     ///         world.

@@ -33,21 +33,34 @@ pub fn step_result<'py>(
 }
 
 fn world_result<'py>(py: Python<'py>, it: &WorldResult) -> PyResult<Bound<'py, PyAny>> {
-    unpacked(py, "WorldResult", "WORLD", bytemuck::bytes_of(it))
+    of(py, "wire", "WorldResult")?.call1((
+        it.step,
+        it.seed,
+        it.episode,
+        it.reward,
+        it.hovered,
+        it.late,
+        it.n_target_cells,
+        it.n_visited,
+        it.n_hits,
+        it.terminated,
+        it.truncated,
+    ))
 }
 
 fn robot_result<'py>(py: Python<'py>, it: &RobotResult) -> PyResult<Bound<'py, PyAny>> {
-    unpacked(py, "RobotResult", "ROBOT", bytemuck::bytes_of(it))
-}
-
-fn unpacked<'py>(
-    py: Python<'py>,
-    class: &str,
-    layout: &str,
-    bytes: &[u8],
-) -> PyResult<Bound<'py, PyAny>> {
-    let fields = of(py, "wire", layout)?.call_method1("unpack", (bytes,))?;
-    of(py, "wire", class)?.call_method1("_make", (fields,))
+    of(py, "wire", "RobotResult")?.call1((
+        it.reward,
+        it.marginal,
+        it.n_visited,
+        it.n_hits,
+        it.start_row,
+        it.start_col,
+        it.row,
+        it.col,
+        it.coverage,
+        it.n_moves,
+    ))
 }
 
 pub fn server_info<'py>(py: Python<'py>, info: &ServerInfo) -> PyResult<Bound<'py, PyAny>> {

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import geopandas
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -141,6 +142,13 @@ HOLE = np.where(EASTWARD == EASTWARD[0, 1], np.nan, EASTWARD)
 LOW = np.where(EASTWARD > 20, -9999.0, EASTWARD)
 
 
+def _square(path: Path) -> Path:
+    """Writes a perimeter."""
+    shape = geopandas.GeoSeries.from_wkt(["POLYGON ((0 0, 0 1, 1 1, 1 0, 0 0))"], crs=4326)
+    geopandas.GeoDataFrame({"time": ["2020-01-01"]}, geometry=shape).to_file(path)
+    return path
+
+
 def refusals(f: Path) -> dict[str, tuple[object, ...]]:
     dem, npy, hole = geotiff(f / DEM, EASTWARD), array(f / "dem.npy", EASTWARD), f / "hole.npy"
     fuel = array(f / "fuel.npy", [[1, 2], [3, 4]])
@@ -182,9 +190,10 @@ def refusals(f: Path) -> dict[str, tuple[object, ...]]:
         "other.tif: expected the extent of ": (
             dem, "--no-fly", geotiff(f / "other.tif", EASTWARD, corner=(0, 0)),
         ),
-        "expected at most 4096 x 4096 cells": (
+        "l.npy: expected at most 4096 x 4096 cells": (
             "--fuel", array(f / "l.npy", np.ones((1, 4097))), "--factors=1=2",
         ),
+        "expected --kind arrival and --cell METRES": (_square(f / "square.geojson"),),
         "expected one layer, got several; choose with --band": (
             array(f / "two.npy", [EASTWARD, EASTWARD]), "--cell=30",
         ),

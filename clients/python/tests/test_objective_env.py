@@ -197,6 +197,8 @@ def test_wrong_keyword_values_are_refused() -> None:
     for keywords, words in (
         ({"estimator": "truth"}, 'estimator: expected one of known, .*, got "truth"'),
         ({"prior": "none"}, "prior: expected 'simulated', 'initial' or 'uniform', got 'none'"),
+        ({"estimator": 3}, "estimator: expected a name, got 3"),
+        ({"prior": None}, "prior: expected a name, got None"),
         ({"checkpoint": 3}, "checkpoint: expected text or a path, got 3"),
         ({"checkpoint": "no file"}, "checkpoint no file: No such file"),
         ({"estimator": "neural"}, "checkpoint.*of `train --learner neural`"),

@@ -81,11 +81,17 @@ impl OpenError {
 
 impl Embedded {
     /// Reads and checks settings as [`settings::read`] does, and creates the worlds.
+    ///
+    /// # Errors
+    /// As for [`settings::read`] and [`Self::new`].
     pub fn open(given: Map<String, Value>) -> Result<Self, OpenError> {
         Self::new(settings::read(given)?).map_err(OpenError::Worlds)
     }
 
     /// Creates the worlds and starts their burn-ins. Ignores settings about channels and automatic snapshots.
+    ///
+    /// # Errors
+    /// If the model does not fit the grid, there is too little memory, or no threads can be started.
     pub fn new(checked: Checked) -> Result<Self> {
         let config = &checked.config;
         let n_threads = n_threads(config).min(config.worlds as usize);
@@ -120,6 +126,9 @@ impl Embedded {
     }
 
     /// Returns the current episodes of consecutive worlds, or `None` if a world does not exist or is being reset.
+    ///
+    /// # Errors
+    /// If the worlds were shut down.
     pub fn episodes(
         &mut self,
         mut worlds: Range<usize>,

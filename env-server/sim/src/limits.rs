@@ -28,6 +28,9 @@ pub fn start(pool: ThreadPoolBuilder, n_threads: usize) -> Result<ThreadPool, No
 
 /// Checks that there is memory for all worlds, for the `n_threads` worlds that may be reset at the same time, and for
 /// the longest answer. Call this function after the threads have started.
+///
+/// # Errors
+/// If there is too little memory.
 pub fn check_memory(checked: &Checked, n_threads: usize) -> Result<(), NoMemory> {
     let n_worlds = checked.config.worlds as usize;
     let n_at_once = (n_worlds + n_threads.min(n_worlds)) as u64;

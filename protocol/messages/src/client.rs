@@ -129,6 +129,9 @@ impl<B: Backend> Client<B> {
 
     /// Flies as [`Self::step`] does, but returns `None` if `is_over` returns true before the worlds have moved.
     /// `is_over` is called periodically, at intervals of [`STEP_TIMEOUT`] plus the server's deadline.
+    ///
+    /// # Errors
+    /// The same as [`Self::step`].
     pub fn step_until(
         &mut self,
         robots: Range<u32>,
@@ -152,6 +155,9 @@ impl<B: Backend> Client<B> {
     }
 
     /// Observes robots and their worlds without changing anything. The robots may be held by other clients.
+    ///
+    /// # Errors
+    /// A refusal if the server has no such robot.
     pub fn observe(&mut self, robots: Range<u32>) -> Result<Vec<Observation>, ConnectionError> {
         let request = self.request(Operation::Observe, &robots);
         self.send(Call::new(request, &[], STEP_TIMEOUT))
@@ -198,6 +204,9 @@ impl<B: Backend> Client<B> {
 
     /// Flies as [`Self::step`] does, with the moves of all paths as bytes. Returns the answer's bytes, without a copy
     /// for each robot: the fastest way to step.
+    ///
+    /// # Errors
+    /// The same as [`Self::step`].
     pub fn step_bytes(
         &mut self,
         robots: &Range<u32>,

@@ -56,11 +56,17 @@ pub struct ServerInfo {
 
 impl ServerInfo {
     /// Returns the height and width of the grid.
+    ///
+    /// # Errors
+    /// If a side is outside `1..=MAX_SIDE`.
     pub fn shape(&self) -> Result<Shape, ShapeError> {
         Shape::new(self.height, self.width)
     }
 
     /// Returns where robots may fly and what they see.
+    ///
+    /// # Errors
+    /// If the map does not fit the grid, or a number is out of range. The error contains the expected value.
     pub fn airspace(&self) -> Result<Airspace, String> {
         let shape = self.shape().map_err(|error| error.to_string())?;
         match &self.airspace {

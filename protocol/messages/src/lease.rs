@@ -125,6 +125,9 @@ impl Lease {
     }
 
     /// Starts new episodes with the given seeds. Returns the worlds when the burn-in is done.
+    ///
+    /// # Errors
+    /// `Busy` if another client holds a robot of these worlds, and `NoLease` if this lease holds none.
     pub fn reset(
         &self,
         backend: &mut dyn Backend,
@@ -158,6 +161,9 @@ impl Lease {
     }
 
     /// Replaces the world `to` with a copy of the world `from`. With the same paths, both have the same future.
+    ///
+    /// # Errors
+    /// As for [`Self::reset`].
     pub fn fork(
         &self,
         backend: &mut dyn Backend,
@@ -169,6 +175,9 @@ impl Lease {
     }
 
     /// Restarts the time until the lease expires, without flying.
+    ///
+    /// # Errors
+    /// `LeaseLost` if the lease no longer holds any robot.
     pub fn renew(
         &self,
         backend: &mut dyn Backend,
@@ -181,6 +190,9 @@ impl Lease {
     }
 
     /// Returns the robots to the server.
+    ///
+    /// # Errors
+    /// `LeaseLost` if the lease no longer holds any robot.
     pub fn release(
         &self,
         backend: &mut dyn Backend,
@@ -262,6 +274,9 @@ impl Lease {
 
     /// Sends a request once, and records the steps in its answer. When a call is first sent, its paths are assigned to
     /// the last known steps of their worlds.
+    ///
+    /// # Errors
+    /// The same as [`Backend::step`].
     pub fn send(
         &self,
         backend: &mut dyn Backend,

@@ -54,6 +54,9 @@ pub fn leave(
 
 /// Loads the belief that was left for a robot about the current step of its world. Returns `None` if there is none, or
 /// none of `kind`, if given.
+///
+/// # Errors
+/// If the server has ended, refuses for another reason, or sends no valid answer in time.
 pub fn load(
     backend: &mut dyn Backend,
     robot: u32,

@@ -39,6 +39,9 @@ pub struct RobotSample<'a> {
 impl StepParts<'_> {
     /// Checks that only existing robots are marked as having stayed, that paths are complete, and that frames contain
     /// only valid observations.
+    ///
+    /// # Errors
+    /// Describes the first wrong value.
     pub fn check(&self, info: &ServerInfo) -> Result<(), String> {
         let n_robots = info.n_robots.clamp(1, MAX_ROBOTS as u32) as usize;
         let stayed = self.worlds.iter().map(|world| world.hovered | world.late);
@@ -152,6 +155,9 @@ pub fn split_frame_payload<'a>(
 }
 
 /// Returns the hidden states in a sample on `truth`.
+///
+/// # Errors
+/// If the payload does not fit the header. The error contains the expected value.
 pub fn truth_states(sample: &Sample<TruthHeader>) -> Result<Grid<u8>, String> {
     let header = &sample.header;
     let shape = Shape::new(header.height as usize, header.width as usize);

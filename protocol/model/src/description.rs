@@ -33,6 +33,9 @@ pub struct DescribedState {
 
 impl Description {
     /// Builds a model with these states, observations and rewards. In this model, no cell ever changes its state.
+    ///
+    /// # Errors
+    /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn unchanging(&self) -> Result<Model, ModelError> {
         let share = 1.0 / self.states.len().max(1) as f64;
         let state = |state: &DescribedState| StateEntry {
@@ -64,6 +67,9 @@ impl Description {
     }
 
     /// Parses a description and builds its unchanging model.
+    ///
+    /// # Errors
+    /// If the text is not a valid description, or an entry is wrong.
     pub fn model_of(text: &str) -> Result<Model, ModelError> {
         toml::from_str::<Self>(text)?.unchanging()
     }

@@ -227,6 +227,9 @@ impl From<toml::de::Error> for ModelError {
 
 impl ModelFile {
     /// Reads a model file, and the map files in its folder. [`super::Model::new`] checks the entries.
+    ///
+    /// # Errors
+    /// If a file cannot be read or parsed.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         let failed = |key: &str, path: &Path, problem: String| ModelError::File {
             path: format!("{key}{}", path.display()),

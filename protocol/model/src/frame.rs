@@ -56,6 +56,9 @@ impl Frame {
     }
 
     /// Decodes `H * W` row-major bytes. One invalid byte makes the whole frame invalid.
+    ///
+    /// # Errors
+    /// [`FrameError`] for a wrong length or a value that is not an observation.
     pub fn from_bytes(
         shape: Shape,
         n_observations: usize,

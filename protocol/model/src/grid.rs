@@ -41,6 +41,10 @@ pub struct ShapeError {
 }
 
 impl Shape {
+    /// Checks both sides and makes a shape.
+    ///
+    /// # Errors
+    /// [`ShapeError`] if a side is outside `1..=MAX_SIDE`.
     pub fn new(height: usize, width: usize) -> Result<Self, ShapeError> {
         let side = 1..=MAX_SIDE;
         if side.contains(&height) && side.contains(&width) {

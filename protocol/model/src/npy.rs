@@ -16,6 +16,10 @@ pub(super) struct Npy<'b> {
 }
 
 impl<'b> Npy<'b> {
+    /// Reads the header of an array.
+    ///
+    /// # Errors
+    /// If the bytes don't begin with the header of a `.npy` file.
     pub fn new(bytes: &'b [u8]) -> Result<Self, String> {
         let header = match bytes.strip_prefix(b"\x93NUMPY") {
             Some([1, _, low, high, ..]) => u16::from_le_bytes([*low, *high]),

@@ -74,17 +74,25 @@ impl Model {
     }
 
     /// Reads and checks a model file's text.
+    ///
+    /// # Errors
+    /// If an entry is wrong. The error names the entry, the expected value and the given value.
     pub fn from_toml(text: &str) -> Result<Self, ModelError> {
         Self::new(toml::from_str(text)?)
     }
 
     /// Reads and checks a model file, and the map files in its folder.
+    ///
+    /// # Errors
+    /// If a file cannot be read, or an entry is wrong.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
         Self::new(ModelFile::read(path)?)
     }
 
-    /// Replaces the radius of the sensor, the number of rows and columns that it sees around each cell of the path, at
-    /// most 8.
+    /// Replaces the radius of the sensor: the number of rows and columns that it sees around each cell of the path.
+    ///
+    /// # Errors
+    /// If the radius is over 8.
     pub fn with_radius(self, radius: usize) -> Result<Self, ModelError> {
         let sensor = (radius > 0).then_some(SensorEntry { radius });
         Self::new(ModelFile {
@@ -127,6 +135,10 @@ impl Model {
     }
 
     /// Checks that the model's maps fit a grid, and that eq. 3 cannot divide by zero or nearly zero there.
+    ///
+    /// # Errors
+    /// If a map does not fit the grid, or if the weights of a cell can sum to nearly zero. The error names the first
+    /// such cell.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
         let no_fly = self.no_fly.as_ref().map(|map| map.dim());
         let maps = self.hazards().and_then(Hazards::shape).map(Shape::dim);
@@ -249,6 +261,9 @@ impl Model {
     }
 
     /// Returns the cells where robots may fly, and the cells that they see from there.
+    ///
+    /// # Errors
+    /// If a map does not fit the grid.
     pub fn airspace(&self, shape: Shape) -> Result<Airspace, ModelError> {
         self.check_on(shape)?;
         Ok(Airspace::new(shape, self.no_fly.clone(), self.radius()))

@@ -68,6 +68,9 @@ impl TryFrom<u8> for Move {
 }
 
 /// Decodes a path from its wire bytes, one byte per move.
+///
+/// # Errors
+/// [`MoveError`] names the first byte that is not a move.
 pub fn path_from_bytes(bytes: &[u8]) -> Result<Vec<Move>, MoveError> {
     check_moves(bytes)?;
     let moves = bytes.iter().map(|&byte| Move::from_low_bits(byte.into()));
@@ -75,6 +78,9 @@ pub fn path_from_bytes(bytes: &[u8]) -> Result<Vec<Move>, MoveError> {
 }
 
 /// Checks that each byte is a move.
+///
+/// # Errors
+/// [`MoveError`] names the first byte that is not a move.
 pub fn check_moves(bytes: &[u8]) -> Result<(), MoveError> {
     let is_wrong = |byte: &u8| usize::from(*byte) >= Move::ALL.len();
     // One pass without branches, which the compiler turns into vector code.

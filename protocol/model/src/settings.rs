@@ -112,6 +112,10 @@ impl Setting {
         for_servers: false,
     };
 
+    /// Checks the type and range of a value.
+    ///
+    /// # Errors
+    /// If the type is wrong, or a number is out of range.
     pub fn check(&self, value: &Value) -> Result<(), SettingError> {
         let number = || value.as_number()?.as_i128();
         let in_range = match self.range {
@@ -124,6 +128,10 @@ impl Setting {
         Err(SettingError::new(self.name, self.expected(), value.clone()))
     }
 
+    /// Parses the value of a flag, and checks it.
+    ///
+    /// # Errors
+    /// Says what was expected.
     pub fn parse(&self, text: &str) -> Result<Value, String> {
         let values = [Some(text.into()), serde_json::from_str(text).ok()];
         let mut values = values.into_iter().flatten();

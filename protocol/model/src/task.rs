@@ -57,6 +57,9 @@ pub struct TaskError {
 
 impl Task {
     /// Loads the built-in task with this name, or the task file at this path.
+    ///
+    /// # Errors
+    /// If there is no such task or file, or the file is not a valid task.
     pub fn named(name: &str) -> Result<Self, TaskError> {
         let read = match TASKS.iter().find(|(known, _)| *known == name) {
             Some((_, text)) => Self::from_toml(text),

@@ -38,6 +38,9 @@ struct Ports {
 
 impl BeliefPublisher {
     /// Opens the channel. `n_bytes` is the size of the first sample in bytes; later samples may be larger.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many agents.
     pub fn open(instance: &Instance, n_bytes: usize) -> Result<Self, ChannelError> {
         let _turn = Turn::take()?;
         let node = create_node()?;
@@ -82,6 +85,9 @@ impl BeliefPublisher {
 
     /// Publishes a belief of shape `[S, H, W]`. The caller fills in the world, robots, episode, step and seed of
     /// `about`.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot publish it, or the channel's files were removed.
     pub fn show(
         &mut self,
         about: AgentHeader,

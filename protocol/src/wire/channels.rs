@@ -125,6 +125,9 @@ impl Services<'_> {
     }
 
     /// Opens or creates the `control` service. Only servers call this.
+    ///
+    /// # Errors
+    /// The same as [`Self::create_step`].
     pub fn create_control(&self) -> Result<ControlService, ChannelError> {
         self.create(Channel::Control)
     }
@@ -144,6 +147,9 @@ impl Services<'_> {
     }
 
     /// Opens or creates the `truth` service. It is for evaluation and display, and learners must never read it.
+    ///
+    /// # Errors
+    /// If iceoryx2 can neither open nor create it.
     pub fn truth(&self) -> Result<TruthService, ChannelError> {
         self.publications(Channel::Truth, 1, MAX_TRUTH_READERS, TRUTH_BUFFER)
             .map_err(ipc_error("open the truth channel"))

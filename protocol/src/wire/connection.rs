@@ -125,6 +125,10 @@ impl Connection {
         &self.info
     }
 
+    /// Sends a request on the control channel.
+    ///
+    /// # Errors
+    /// If the server refuses, has ended, or sends no valid answer in time.
     pub fn control(
         &mut self,
         request: &Request,

@@ -39,6 +39,9 @@ pub struct Entries {
 
 impl Entries {
     /// Lists the files of a node. Call it after the node's ports have been created.
+    ///
+    /// # Errors
+    /// If the files cannot be listed.
     pub fn of(node: &Node<Ipc>) -> Result<Self, ChannelError> {
         let (directory, id) = (channel_directory(), node.id().value());
         let folder = directory.join(format!("nodes/{id}"));
@@ -61,6 +64,9 @@ impl Entries {
     }
 
     /// Checks as [`Self::check`] does, but does nothing if the last check was shortly before `now`.
+    ///
+    /// # Errors
+    /// If a file was removed.
     pub fn check_at(&self, now: Instant) -> Result<(), ChannelError> {
         if now.saturating_duration_since(self.checked.get()) < CHECK_INTERVAL {
             return Ok(());
@@ -71,6 +77,9 @@ impl Entries {
     }
 
     /// Checks that all files still exist.
+    ///
+    /// # Errors
+    /// If a file was removed.
     pub fn check(&self) -> Result<(), ChannelError> {
         let removed = self
             .paths

@@ -66,6 +66,9 @@ struct Polling {
 
 impl Observer<FrameHeader> {
     /// Opens the frames of an instance. The server then immediately publishes the current frame of every world.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many observers.
     pub fn frames(instance: &Instance) -> Result<Self, ChannelError> {
         let frames = |services: &Services<'_>| services.frames();
         Self::new(instance, frames, FRAME_BUFFER, "16 observers", true)
@@ -74,6 +77,9 @@ impl Observer<FrameHeader> {
 
 impl Observer<TruthHeader> {
     /// Opens the hidden states of an instance. They arrive only if the instance's server publishes them.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many readers.
     pub fn truth(instance: &Instance) -> Result<Self, ChannelError> {
         let truth = |services: &Services<'_>| services.truth();
         Self::new(
@@ -88,6 +94,9 @@ impl Observer<TruthHeader> {
 
 impl Observer<AgentHeader> {
     /// Opens the beliefs of an instance's agents. [`super::agent_belief::AgentBelief`] checks each sample.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many readers.
     pub fn agents(instance: &Instance) -> Result<Self, ChannelError> {
         let agent = |services: &Services<'_>| services.agent();
         Self::new(instance, agent, AGENT_BUFFER, "4 readers of beliefs", false)
@@ -141,6 +150,9 @@ impl<H: Published> Observer<H> {
 
     /// Waits for the next sample. Returns `None` if no sample arrived in time. A gap in the headers' sequence numbers
     /// means that this observer was too slow and lost samples.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot read the channel, or its files were removed.
     pub fn receive(&self, timeout: Duration) -> Result<Option<Sample<H>>, ChannelError> {
         let start = Instant::now();
         loop {

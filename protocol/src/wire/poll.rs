@@ -21,6 +21,9 @@ pub fn sleep_until_readable(
 }
 
 /// Sleeps as [`sleep_until_readable`] does. Returns whether a descriptor is readable or a signal arrived.
+///
+/// # Errors
+/// If the system cannot wait. The error is never `EINTR`.
 pub fn sleep_until_event(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> Result<bool, Errno> {
     match readable(descriptors, timeout) {
         Err(Errno::INTR) => Ok(true),

@@ -31,6 +31,9 @@ impl WatchedProcess {
     }
 
     /// Watches the process that `--exit-with` names.
+    ///
+    /// # Errors
+    /// If the process does not run, or the system does not allow watching it.
     pub fn watch(pid: i32) -> Result<Self, NotWatched> {
         Self::open(pid).map_err(|errno| match errno {
             Errno::SRCH | Errno::INVAL => NotWatched::NotRunning { pid },
@@ -42,6 +45,9 @@ impl WatchedProcess {
     }
 
     /// Checks that this process may watch others. Otherwise it could not notice their deaths.
+    ///
+    /// # Errors
+    /// If the system does not allow it.
     pub fn check() -> Result<(), ChannelError> {
         Self::open(getpid().as_raw_nonzero().get())
             .map(drop)

@@ -43,6 +43,9 @@ pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelEr
 
 /// Checks that `n_bytes` bytes of shared memory and enough files for the ports of a connection are free, and that a
 /// file may have `longest_file` bytes.
+///
+/// # Errors
+/// If less is available.
 pub fn check_room(n_bytes: u64, longest_file: u64) -> Result<(), ChannelError> {
     let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
     if limit < longest_file {

@@ -29,6 +29,9 @@ pub struct MessageMemory {
 
 /// Allocates memory for everything that a node's ports and services write to. The memory of messages is included only
 /// if `with_messages` is set. Programs with large messages allocate it with [`MessageMemory`] instead.
+///
+/// # Errors
+/// If there is not enough memory.
 pub fn fill_ports(node: &Node<Ipc>, with_messages: bool) -> Result<(), ChannelError> {
     let files = ChannelFiles::of_user();
     let wrong = |error: std::io::Error| not_usable(&files.root, error);
@@ -52,6 +55,9 @@ pub fn fill_ports(node: &Node<Ipc>, with_messages: bool) -> Result<(), ChannelEr
 impl MessageMemory {
     /// Finds the memory of a port, which must have space for at least `n_messages` messages of at least `message_bytes`
     /// bytes.
+    ///
+    /// # Errors
+    /// If the port has no such file.
     pub fn of(port: u128, n_messages: usize, message_bytes: usize) -> Result<Self, ChannelError> {
         let files = ChannelFiles::of_user();
         let wrong = |error: std::io::Error| not_usable(SHARED_MEMORY.as_ref(), error);
@@ -81,6 +87,9 @@ impl MessageMemory {
     }
 
     /// Allocates memory for the first `n_messages` messages.
+    ///
+    /// # Errors
+    /// If there is not enough memory for them.
     pub fn make_ready(&self, n_messages: usize) -> Result<(), ChannelError> {
         let n_messages = (n_messages as u64).min(self.n_messages);
         let n_ready = self.n_ready.get();

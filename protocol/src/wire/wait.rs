@@ -22,6 +22,9 @@ impl Waiter {
     ///
     /// `block` must not sleep longer than the duration passed to it. It is called repeatedly until the timeout, so it
     /// may return early for any reason.
+    ///
+    /// # Errors
+    /// The first error of `poll` or `block`.
     pub fn wait<T, E>(
         &self,
         timeout: Duration,
@@ -60,6 +63,9 @@ pub fn descriptor(listener: &Listener<Ipc>) -> BorrowedFd<'_> {
 }
 
 /// Drops a listener's wake-ups, and returns whether there were any.
+///
+/// # Errors
+/// If iceoryx2 cannot read them.
 pub fn drain(listener: &Listener<Ipc>) -> Result<bool, ChannelError> {
     let drained = listener.try_wait(|_| {});
     drained

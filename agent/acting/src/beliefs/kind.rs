@@ -67,7 +67,10 @@ impl Traits {
     }
 }
 
-/// Returns an estimator as its own type. Panics if it has another type.
+/// Returns an estimator as its own type.
+///
+/// # Panics
+/// If it has another type.
 pub fn cast<E: Estimator>(estimator: &dyn Estimator) -> &E {
     let own = (estimator as &dyn Any).downcast_ref();
     own.expect("invariant: the kind builds estimators of this type")
@@ -125,12 +128,18 @@ pub struct Conditions<'a> {
 }
 
 impl<'a> Conditions<'a> {
-    /// Returns the model, or an error if it is unknown.
+    /// Returns the model.
+    ///
+    /// # Errors
+    /// If the model is unknown.
     pub fn model(&self) -> Result<&'a Model> {
         self.model.context("model: expected a model, got none")
     }
 
-    /// Returns the first belief, or an error if there is none.
+    /// Returns the first belief.
+    ///
+    /// # Errors
+    /// If there is no first belief.
     pub fn prior(&self) -> Result<Belief> {
         let prior = self.prior.cloned();
         prior.context("prior: expected a first belief, got none")
@@ -143,7 +152,10 @@ impl BeliefKind {
         self.learned_by.as_ref().is_some_and(|by| by.decides)
     }
 
-    /// Returns the learned model, `None` if this kind uses none, or an error if no checkpoint contains it.
+    /// Returns the learned model, or `None` if this kind does not use one.
+    ///
+    /// # Errors
+    /// If this kind needs a learned model and no checkpoint contains it.
     pub fn learned<'a>(&self, learned: &'a Learned) -> Result<Option<&'a dyn LearnedBelief>> {
         let Some(by) = &self.learned_by else {
             return Ok(None);
@@ -166,7 +178,10 @@ impl BeliefKind {
         learned.map_or(Ok(()), |learned| learned.check_world(world))
     }
 
-    /// Returns the names of the belief's states, or an error if both the model and a learned model are missing.
+    /// Returns the names of the belief's states.
+    ///
+    /// # Errors
+    /// If both the model and a learned model are missing.
     pub fn state_names(&self, conditions: &Conditions<'_>) -> Result<Vec<String>> {
         Ok(match self.learned(conditions.learned)? {
             Some(learned) => numbered_states(learned.n_states()),
@@ -174,7 +189,10 @@ impl BeliefKind {
         })
     }
 
-    /// Returns the belief's index of the state with the highest reward. Errors are those of [`Self::state_names`].
+    /// Returns the index, in the belief, of the state with the highest reward.
+    ///
+    /// # Errors
+    /// Under the same conditions as [`Self::state_names`].
     pub fn target(&self, conditions: &Conditions<'_>) -> Result<usize> {
         Ok(match self.learned(conditions.learned)? {
             Some(learned) => learned.target(),

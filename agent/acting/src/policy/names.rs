@@ -72,7 +72,10 @@ impl Policy {
         }
     }
 
-    /// Parses a short name or the names of the parts. The error lists the valid names.
+    /// Parses a policy from its short name or the names of its parts.
+    ///
+    /// # Errors
+    /// If a part is unknown. The error lists the valid names.
     pub fn named(name: &str, model: &Model) -> Result<Self> {
         let states = model.state_names().join(", ");
         let parts = parse(name, &|state| model.state_named(state), &states);
@@ -80,7 +83,10 @@ impl Policy {
     }
 }
 
-/// Checks a name without a model, with any word as the name of a state. The error lists the valid names.
+/// Checks a policy's name without a model. Any word is accepted as the name of a state.
+///
+/// # Errors
+/// If the name is invalid under every model. The error lists the valid names.
 pub fn check_name(name: &str) -> Result<()> {
     // Any word can be the name of a state.
     let is_word = |state: &str| (!state.is_empty()).then_some(0);

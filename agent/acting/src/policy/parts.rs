@@ -39,7 +39,10 @@ impl Policy {
         self.goal == Goal::Learned || self.belief.learned_by.is_some()
     }
 
-    /// Checks that the checkpoints contain what the policy uses. The error names the learner of what is missing.
+    /// Checks that the checkpoints contain everything that the policy uses.
+    ///
+    /// # Errors
+    /// If something is missing. The error names the learner that creates it.
     pub fn check(&self, learned: &Learned) -> Result<()> {
         let of_policy = || format!("policy {:?} needs --checkpoint FILE", self.name);
         self.belief.learned(learned).with_context(of_policy)?;
@@ -49,7 +52,10 @@ impl Policy {
         Ok(())
     }
 
-    /// Returns the decisions that were learned on the policy's belief, or an error if there are none.
+    /// Returns the decisions that were learned on the policy's belief.
+    ///
+    /// # Errors
+    /// If there are no learned decisions, or they were learned on another belief.
     pub fn decisions<'a>(&self, learned: &'a Learned) -> Result<&'a LearnedDecisions> {
         let decisions = learned.get::<LearnedDecisions>();
         let decisions =

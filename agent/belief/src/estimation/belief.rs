@@ -52,7 +52,10 @@ impl Belief {
         Self::everywhere(&initial, shape)
     }
 
-    /// Creates an oracle's belief from states `[H, W]`, or returns an error if one is not below `n_states`.
+    /// Creates a belief with probability 1 for each cell's given state, shape `[H, W]`: the belief of an oracle.
+    ///
+    /// # Errors
+    /// If a state is not below `n_states`.
     pub fn from_states(states: &Grid<u8>, n_states: usize) -> Result<Self, BeliefError> {
         let (height, width) = states.dim();
         let shape = Shape::new(height, width)?;
@@ -149,7 +152,10 @@ impl Belief {
         self.probabilities.view()
     }
 
-    /// Returns the probability of one state in each cell, shape `[H, W]`. Panics if `state` is not below S.
+    /// Returns the probability of one state in each cell, shape `[H, W]`.
+    ///
+    /// # Panics
+    /// If `state` is not below S.
     pub fn probability(&self, state: usize) -> ArrayView2<'_, f32> {
         self.probabilities.index_axis(Axis(0), state)
     }
@@ -175,7 +181,10 @@ impl Belief {
         Grid::from_shape_vec(self.shape.dim(), entropy).expect("invariant: one value per cell")
     }
 
-    /// Draws each cell's state from its own distribution, shape `[H, W]`. Panics with more than 256 states.
+    /// Draws each cell's state from the cell's own distribution, shape `[H, W]`.
+    ///
+    /// # Panics
+    /// If there are more than 256 states.
     pub fn sample(&self, rng: &mut ChaCha8Rng) -> Grid<u8> {
         let (cells, n_states) = (0..self.shape.n_cells(), self.n_states());
         assert!(n_states <= 256, "belief: expected states that fit a byte");

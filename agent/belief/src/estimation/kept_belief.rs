@@ -129,6 +129,9 @@ impl KeptBelief {
     }
 
     /// Writes the belief for later runs, and removes the oldest files beyond the maximum number.
+    ///
+    /// # Errors
+    /// If the folder or the file cannot be written.
     pub fn write(&self, belief: &Belief) -> std::io::Result<()> {
         let mut bytes = self.key.clone().into_bytes();
         let values = belief.probabilities().iter();

@@ -57,7 +57,10 @@ pub struct Tables {
 }
 
 impl Dimensions {
-    /// Returns the dimensions. An error names the first that is out of a model's range.
+    /// Checks the dimensions against the limits of a model, and returns them.
+    ///
+    /// # Errors
+    /// If a dimension is out of range. The error names the first such dimension.
     pub fn check(self) -> Result<Self, String> {
         let counts = [
             ("states", 2, self.n_states),

@@ -17,7 +17,10 @@ const DISCOUNT: f32 = 0.8;
 pub struct Ahead(BeamSearch);
 
 impl Ahead {
-    /// Creates a planner with a beam of `width` states, at least 1.
+    /// Creates a planner with a beam of `width` states.
+    ///
+    /// # Panics
+    /// If `width` is 0.
     pub fn new(width: usize) -> Self {
         Self(BeamSearch::new(width))
     }

@@ -73,7 +73,10 @@ impl Default for BeamSearch {
 }
 
 impl BeamSearch {
-    /// Creates a search that keeps `width` states, at least 1.
+    /// Creates a search that keeps `width` states.
+    ///
+    /// # Panics
+    /// If `width` is 0.
     pub fn new(width: usize) -> Self {
         assert!(
             width > 0,

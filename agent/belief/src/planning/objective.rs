@@ -27,7 +27,10 @@ pub enum Target {
 }
 
 impl Target {
-    /// Returns a one-word label for display. `states` are the names of all states of the belief.
+    /// Returns a one-word label for display. `states` are the names of the belief's states.
+    ///
+    /// # Panics
+    /// If a state has no name.
     pub fn label(self, states: &[String]) -> String {
         match self {
             Self::State(state) => states[state].clone(),

@@ -129,7 +129,10 @@ pub struct Proposal {
 pub struct OptionPlanner(BeamSearch);
 
 impl OptionPlanner {
-    /// Creates a planner with a beam of `width` states, at least 1.
+    /// Creates a planner with a beam of `width` states.
+    ///
+    /// # Panics
+    /// If `width` is 0.
     pub fn new(width: usize) -> Self {
         Self(BeamSearch::new(width))
     }

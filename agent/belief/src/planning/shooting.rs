@@ -81,7 +81,10 @@ impl Integration {
 }
 
 impl Shooting {
-    /// Creates a planner that draws `n_samples` samples, at least 1.
+    /// Creates a planner that draws `n_samples` samples.
+    ///
+    /// # Panics
+    /// If `n_samples` is 0.
     pub fn new(n_samples: usize, integration: Integration) -> Self {
         assert!(
             n_samples > 0,

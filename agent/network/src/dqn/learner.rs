@@ -211,7 +211,10 @@ impl Dqn {
         self.settings.adam.learning_rate = learning_rate;
     }
 
-    /// Computes the value of each choice of a decision, `Q(h, .)`. Panics if `input` has the wrong length.
+    /// Computes the value of each choice of a decision, `Q(h, .)`.
+    ///
+    /// # Panics
+    /// If `input` has the wrong length.
     pub fn values(&self, input: &[f32]) -> Vec<f32> {
         assert_eq!(
             input.len(),

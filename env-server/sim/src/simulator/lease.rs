@@ -86,6 +86,9 @@ impl Leases {
     }
 
     /// Grants a lease under a new token. Robots that the client already holds move to the new lease.
+    ///
+    /// # Errors
+    /// If a robot does not exist, or another client holds one and the claim is not a takeover.
     pub fn acquire(&mut self, now: Instant, claim: Claim, token: u64) -> Result<&Lease, Refusal> {
         self.check_robots(&claim.robots)?;
         self.expire(now);

@@ -32,6 +32,9 @@ struct Limit {
 }
 
 /// Checks that this process can allocate `n_bytes` for `what`.
+///
+/// # Errors
+/// If the machine, a cgroup or a `ulimit` has less memory.
 pub fn check(what: impl Display, n_bytes: u64) -> Result<(), NoMemory> {
     check_below(Path::new("/"), &what, n_bytes)?;
     // Some limits appear in no file, such as the limit on overcommitted memory.
@@ -53,6 +56,9 @@ pub fn refused(what: impl Display, n_bytes: u64) -> NoMemory {
 }
 
 /// Allocates an empty vector whose capacity depends on external input.
+///
+/// # Errors
+/// If there is not enough memory.
 pub fn with_capacity<T>(what: impl Display, capacity: usize) -> Result<Vec<T>, NoMemory> {
     let mut empty = Vec::new();
     let n_bytes = capacity.saturating_mul(size_of::<T>()) as u64;

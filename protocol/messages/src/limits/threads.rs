@@ -29,6 +29,10 @@ pub struct NoThreads {
     reason: String,
 }
 
+/// Starts a thread with this name.
+///
+/// # Errors
+/// If the system does not start the thread.
 pub fn spawn<T: Send + 'static>(
     name: &str,
     work: impl FnOnce() -> T + Send + 'static,

@@ -27,6 +27,10 @@ pub struct Writer<W> {
 }
 
 impl<W: Write> Writer<W> {
+    /// Begins a recording.
+    ///
+    /// # Errors
+    /// If the system returns an error.
     pub fn new(mut output: W) -> Result<Self, RecordingError> {
         let header = FileHeader {
             magic: MAGIC,
@@ -82,6 +86,9 @@ impl<W: Write> Writer<W> {
     }
 
     /// Writes the end record, and returns the totals of the recording.
+    ///
+    /// # Errors
+    /// If the system returns an error.
     pub fn finish(&mut self) -> Result<Totals, RecordingError> {
         let totals = self.progress.totals;
         self.body.clear();

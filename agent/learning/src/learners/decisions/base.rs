@@ -9,7 +9,10 @@ use emberwatch_belief::estimation::Estimator;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_model::{Model, Shape};
 
-/// Finds the belief of the setting `decisions.estimator`. The error lists all valid names.
+/// Finds the belief that decisions are based on, given the setting `decisions.estimator`.
+///
+/// # Errors
+/// If there is no such belief. The error lists all valid names.
 pub fn belief_of(name: &str) -> Result<&'static BeliefKind> {
     let kind = beliefs::of_options(name);
     kind.map_err(|problem| anyhow::anyhow!("decisions.estimator: {problem}"))

@@ -85,7 +85,10 @@ impl LessonReplay {
         }
     }
 
-    /// Returns a robot's sightings so far. Panics if the robot has no track.
+    /// Returns a robot's sightings so far.
+    ///
+    /// # Panics
+    /// If the robot has no track.
     pub fn present(&self, robot: u32) -> Sightings {
         let block = &self.open[&robot];
         block.before_frame(block.frames.len())

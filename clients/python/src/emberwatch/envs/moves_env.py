@@ -1,6 +1,6 @@
 """`emberwatch/WildfireMoves-v0`: one step is one move, and the world moves after T moves."""
 
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -16,7 +16,7 @@ from emberwatch.envs.observations import WINDOW, MovesParts, Observations
 from emberwatch.envs.owner import SessionOwner
 from emberwatch.envs.plans import Plans
 from emberwatch.envs.session import Session, not_reset
-from emberwatch.envs.settings import Settings, shows_keywords
+from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv
 from emberwatch.model.moves import fly
 
@@ -135,7 +135,7 @@ class WildfireMovesEnv(MovesOwner, WorldEnv):
         reward: MovesReward = "share",
         window: int = WINDOW,
         kind: str = "known",
-        **world: Any,
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
         settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
@@ -210,7 +210,7 @@ class WildfireMovesVectorEnv(MovesOwner, WorldVectorEnv):
         reward: MovesReward = "share",
         window: int = WINDOW,
         kind: str = "known",
-        **world: Any,
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
         pays = check_reward(reward, "move")

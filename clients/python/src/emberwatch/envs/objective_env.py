@@ -1,7 +1,7 @@
 """`emberwatch/WildfireObjective-v1`: one step chooses the objective of the next path."""
 
 from os import PathLike
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -11,7 +11,7 @@ from emberwatch.common.arguments import as_choice, as_choices
 from emberwatch.envs.base import WorldEnv
 from emberwatch.envs.plans import FirstBelief, Plans, PlansOwner
 from emberwatch.envs.session import Session
-from emberwatch.envs.settings import Settings, shows_keywords
+from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv
 
 
@@ -77,7 +77,7 @@ class WildfireObjectiveEnv(PlansOwner, WorldEnv):
         estimator: str | None = None,
         checkpoint: str | PathLike[str] | None = None,
         prior: FirstBelief = "simulated",
-        **world: Any,
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
         session = Session(Settings.of(WildfireObjectiveEnv, world))
@@ -116,7 +116,7 @@ class WildfireObjectiveVectorEnv(PlansOwner, WorldVectorEnv):
         estimator: str | None = None,
         checkpoint: str | PathLike[str] | None = None,
         prior: FirstBelief = "simulated",
-        **world: Any,
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
         session = Session(Settings.of(WildfireObjectiveVectorEnv, world), num_envs)

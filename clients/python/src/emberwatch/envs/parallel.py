@@ -4,7 +4,7 @@
 # pyright: reportUnknownArgumentType=false
 
 from copy import deepcopy
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -19,7 +19,7 @@ from emberwatch.envs.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.envs.observations import MovesParts, names_of, of_row
 from emberwatch.envs.owner import METADATA, state_of
 from emberwatch.envs.path_env import WildfireVectorEnv
-from emberwatch.envs.settings import shows_keywords
+from emberwatch.envs.settings import WorldArguments, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv, info_of
 from emberwatch.errors import invalid, repr_of
 
@@ -61,7 +61,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         max_episode_steps: int | Literal["task"] | None = "task",
         window: int | None = None,
         kind: str = "known",
-        **world: Any,
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. Worlds are created or acquired at the first reset."""
         if action not in _ENVIRONMENTS:

@@ -1,7 +1,7 @@
 """`emberwatch/Wildfire-v0`: one step flies one path."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Unpack
 
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
@@ -10,7 +10,7 @@ from emberwatch.client import wire
 from emberwatch.envs.base import Reward, WorldEnv, check_reward
 from emberwatch.envs.observations import Observations, Parts, has_memory
 from emberwatch.envs.session import Session
-from emberwatch.envs.settings import Settings, shows_keywords
+from emberwatch.envs.settings import Settings, WorldArguments, shows_keywords
 from emberwatch.envs.vector_base import WorldVectorEnv
 
 
@@ -156,7 +156,7 @@ class WildfireEnv(WorldEnv):
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
         kind: str = "known",
-        **world: Any,
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
         session = Session(Settings.of(WildfireEnv, world))
@@ -192,7 +192,7 @@ class WildfireVectorEnv(WorldVectorEnv):
         observation: Parts = ("frame", "robot"),
         reward: Reward = "share",
         kind: str = "known",
-        **world: Any,
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class."""
         pays = check_reward(reward)

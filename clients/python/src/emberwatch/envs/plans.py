@@ -11,7 +11,7 @@ import emberwatch._native as _native
 from emberwatch.client.wire import RobotResult, StepAnswer, StepResult, WorldResult
 from emberwatch.common.paths import utf8
 from emberwatch.envs.session import Session
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid, repr_of
 
 FirstBelief: TypeAlias = Literal["simulated", "initial", "uniform"]
 
@@ -39,6 +39,10 @@ class Plans:
             raise InvalidArgumentError(
                 "robots, robot: expected worlds of one robot, as options are planned for one robot"
             )
+        names: dict[str, object] = {"estimator": estimator, "prior": prior}
+        for name, value in names.items():
+            if not isinstance(value, str) and (name, value) != ("estimator", None):
+                raise invalid(name, "a name", repr_of(value))
         self._session = session
         path = None if checkpoint is None else utf8("checkpoint", checkpoint)
         # The bytes, because the file may change or move before a reset makes the beliefs again.

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from types import NoneType
-from typing import Any, Final, TypeVar, cast, get_args, get_type_hints
+from typing import Any, Final, TypedDict, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 
@@ -35,6 +35,37 @@ _KEYWORDS: Final = {
 }
 
 _Init = TypeVar("_Init")
+
+
+class WorldArguments(TypedDict, total=False):
+    """The keywords of all environments, with their types."""
+
+    instance: str | None
+    world: int
+    robot: int | None
+    takeover: bool
+    task: str | Path | None
+    truth: bool
+    timeout: float
+    render_mode: str | None
+    # Settings of worlds.
+    robots: int | None
+    model: Model | str | Path | None
+    states: str | Path | None
+    states_symmetries: bool | None
+    states_offset: int | None
+    height: int | None
+    width: int | None
+    n_moves: int | None
+    burn_in: int | None
+    sensor_radius: int | None
+    start: str | None
+
+
+KEYWORDS: Final[dict[str, Any]] = get_type_hints(WorldArguments)
+
+#: The keywords that are settings of worlds: `robots` and those after it.
+OF_WORLDS: Final = tuple(KEYWORDS)[tuple(KEYWORDS).index("robots") :]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,9 +98,7 @@ class Settings:
     needs_truth: bool = False
 
     @classmethod
-    def of(
-        cls, environment: type, world: Mapping[str, Any], *, needs_truth: bool = False
-    ) -> Settings:
+    def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
         """Makes settings from an environment's shared keywords.
 
         Raises:
@@ -91,6 +120,8 @@ class Settings:
         settings = cls(**given, needs_truth=needs_truth)
         if not settings.timeout > 0:
             raise invalid("timeout", "seconds above 0", settings.timeout)
+        if "num_envs" in known and settings.robot is not None:
+            raise invalid("robot", "None, as all robots of the worlds are flown", settings.robot)
         return settings
 
     @property
@@ -110,17 +141,6 @@ class Settings:
         own = {"task": self.task, "publish_truth": self.reads_truth, "history": self.history}
         with _names_keywords():
             return read_settings({**own, **worlds})
-
-
-#: The keywords of all environments, with their types.
-KEYWORDS: Final[dict[str, Any]] = {
-    name: kind
-    for name, kind in get_type_hints(Settings).items()
-    if name not in ("history", "needs_truth")
-}
-
-#: The keywords that are settings of worlds: `robots` and those after it.
-OF_WORLDS: Final = tuple(KEYWORDS)[tuple(KEYWORDS).index("robots") :]
 
 
 def _checked(keyword: str, value: Any) -> Any:
@@ -286,8 +306,6 @@ def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
     """Returns the numbers of the robots to fly: one robot, or all robots of some worlds."""
     first = settings.world * n_robots
     if settings.robot is not None:
-        if n_rows != 1:
-            raise InvalidArgumentError("robot: expected None, as all robots of a world are flown")
         if not 0 <= settings.robot < n_robots:
             raise invalid("robot", f"0 to {n_robots - 1}" if n_robots > 1 else "0", settings.robot)
         return range(first + settings.robot, first + settings.robot + 1)

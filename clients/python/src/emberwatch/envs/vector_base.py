@@ -62,8 +62,6 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
     ) -> None:
-        if session.settings.robot is not None:
-            raise invalid("robot", "None, as vectors fly all robots", session.settings.robot)
         if max_episode_steps == -1:  # means no limit in `gymnasium.make`
             max_episode_steps = None
         if max_episode_steps is not None:

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES
+from emberwatch._native import MAX_ARCHIVE_BYTES, MAX_MAP_VALUES, MAX_SIDE
 from emberwatch.common.output import Parser, number
 from emberwatch.common.paths import shown, utf8
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.flags import METRES, add_common
-from emberwatch.landscape.grid import check_same, target_shape
+from emberwatch.landscape.grid import check_same
 from emberwatch.landscape.inputs import read, stacks
 from emberwatch.landscape.layers import Layer, check_full
 from emberwatch.landscape.terrain import UNITS, model_text, slope_and_wind, slopes
@@ -49,7 +49,7 @@ def parser() -> Parser:
     add("--factors", type=_factors, metavar="N=X,N=X", help="factors of the hazard of classes [1]")
     add("--no-fly", type=Path, metavar="RASTER", help="a number above 0 is a no-fly cell")
     add_common(made)
-    made.set_defaults(kind=None, act=make)
+    made.set_defaults(kind=None, act=make, time_column=None)
     return made
 
 
@@ -119,8 +119,12 @@ def _layer(file: Path, flags: argparse.Namespace) -> Layer:
         found = list(islice(layers, 2))
     if len(found) != 1:
         raise invalid(file, "one layer", "several; choose with --band")
-    target_shape(found[0].place, height=None, cell=None)  # refuses too many cells
-    return found[0]
+    (layer,) = found
+    height, width = layer.place.shape
+    if max(height, width) > MAX_SIDE:
+        most = f"at most {MAX_SIDE} x {MAX_SIDE} cells, the server's maximum"
+        raise invalid(layer.name, most, f"{height} x {width}")
+    return layer
 
 
 def _fuel(flags: argparse.Namespace, layer: Layer) -> NDArray[np.float64]:
