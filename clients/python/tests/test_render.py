@@ -3,11 +3,13 @@
 import logging
 import re
 import sys
+from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
+from environments import actions, make, make_vec
 from numpy.typing import NDArray
 
 from emberwatch.model import Model
@@ -191,6 +193,20 @@ def test_a_terminal_redraws_the_text_in_place(
     first, second = ansi(Picture(**PARTS)), ansi(Picture(**PARTS, truth=TRUTH))
     shown = f"\x1b[2J\x1b[H{first}\x1b[K\n\x1b[J\x1b[H{second}\x1b[K\n\x1b[J"
     assert capsys.readouterr().out == shown
+
+
+@pytest.mark.parametrize("making", [make, partial(make_vec, 2)])
+def test_each_step_is_shown_to_a_human(
+    making: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    shown, drawn = (making(render_mode=mode) for mode in ("human", "ansi"))
+    for env in (drawn, shown):
+        env.reset(seed=1)
+        capsys.readouterr()
+        env.step(actions(env, 1)[0])
+    picture = np.atleast_1d(drawn.render())[0]
+    assert picture in capsys.readouterr().out and shown.render() in (None, (None, None))
 
 
 def test_a_missing_screen_is_logged_once(
