@@ -43,7 +43,7 @@ def check_place() -> None:
 
 def check_versions() -> None:
     """Checks that the package and the programs have the same version."""
-    version = output(sys.executable, "-m", "emberwatch", "--version").split()[-1]
+    version = output(sys.executable, "-c", "import emberwatch; print(emberwatch.__version__)").strip()
     for name in PROGRAMS:
         assert output(find(name), "--version").split() == [name, version]
 
