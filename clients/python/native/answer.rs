@@ -111,8 +111,9 @@ impl StepAnswer {
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
         let first = self.result(py, 0)?.repr()?;
         Ok(format!(
-            "<StepAnswer of {} robots: {first}, ...>",
-            self.n_robots
+            "<StepAnswer of robots {} to {}, the first: {first}>",
+            self.first_robot,
+            self.first_robot + self.n_robots - 1
         ))
     }
 

@@ -238,7 +238,7 @@ def test_cut_and_damaged_recordings_are_named(studio: Studio, tmp_path: Path) ->
 WRONG: list[tuple[list[object], str]] = [
     (["--world", 7], "--world: expected one of the recorded worlds: 0, got 7"),
     (["--step", 9], "expected some of the recorded steps, of which the last is 8, got 9 to 9"),
-    (["--every", 0], "--every: expected a whole number, 1 to inf, got 0"),
+    (["--every", 0], "--every: expected a whole number, 1 or more, got 0"),
     (["--out", "lab.mp4"], "--out: expected a .gif, or with --step a .png, got lab.mp4"),
     (["--out", "/dev/null/a.gif"], "/dev/null"),
 ]

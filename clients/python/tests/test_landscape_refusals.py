@@ -129,7 +129,7 @@ CASES: list[tuple[str, Case]] = [
         layers(MASKS, ONE)),
     ("to 1000000000000000000, got 2020-10-14", arrivals("--begin", "2020-10-14")),
     ("--burning: expected a whole number, 1 to 999999999, got 0", arrivals("--burning", 0)),
-    ("--cell: expected 0.001 to 1000000000, got 0", arrivals("--cell", 0)),
+    ("--cell: expected metres, 0.001 to 1000000000, got 0", arrivals("--cell", 0)),
     ("--codes: expected three different numbers, got 1,2",
         layers(STATES, ONE, flags=("--codes=1,2",))),
     ("bytes of states, got 5000000001 steps of 3 x 4",

@@ -66,4 +66,4 @@ def test_a_server_answers_as_in_the_worked_example() -> None:
     assert world == same and read == values[len(LAYOUTS["StepReply"].fields) :]
     for each, result in zip(answer.results, (first, second), strict=True):
         assert (tuple(each["world"]), tuple(each["robot"])) == (world, result)
-    assert repr(answer) == f"<StepAnswer of 2 robots: {answer.result()}, ...>"
+    assert repr(answer) == f"<StepAnswer of robots 0 to 1, the first: {answer.result()}>"

@@ -58,10 +58,13 @@ pub struct Embedded {
     is_over: bool,
 }
 
+/// The reason why worlds could not be opened.
 #[derive(Debug, Error)]
 pub enum OpenError {
+    /// The settings could not be read.
     #[error(transparent)]
     Settings(#[from] ReadError),
+    /// The worlds could not be created.
     #[error("{0:#}")]
     Worlds(anyhow::Error),
 }

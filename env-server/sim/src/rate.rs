@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 const RATE_WINDOW: Duration = Duration::from_secs(1);
 
+/// A measurement of world steps per second over the last window.
 pub struct Rate {
     since: Instant,
     n_steps: u64,

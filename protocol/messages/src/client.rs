@@ -68,10 +68,12 @@ impl<B: Backend> Client<B> {
         self.backend.info()
     }
 
+    /// Returns the backend (a connection, or worlds in this process), for requests that have no method here.
     pub fn backend(&mut self) -> &mut B {
         &mut self.backend
     }
 
+    /// Returns the lease's number, for requests that have no method here.
     pub fn lease(&self) -> u64 {
         self.lease.number()
     }
@@ -91,6 +93,7 @@ impl<B: Backend> Client<B> {
         left_belief::leave(&mut self.backend, place, at, kind, bytes, STEP_TIMEOUT)
     }
 
+    /// Returns the belief of this kind that was left for a robot (see [`left_belief::load`]).
     pub fn left_belief(
         &mut self,
         robot: u32,

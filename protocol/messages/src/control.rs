@@ -83,7 +83,9 @@ pub struct WorldSeed {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "reply", rename_all = "snake_case")]
 pub enum Reply {
+    /// Answers `hello`.
     Hello(Box<ServerInfo>),
+    /// Answers `acquire` and `renew`.
     Lease(LeaseInfo),
     /// Answers `release`, `leave_belief` and `shutdown`.
     Done,
@@ -103,6 +105,7 @@ pub enum Reply {
     Restored {
         worlds: Vec<WorldInfo>,
     },
+    /// Answers `belief`.
     Belief {
         #[serde(flatten)]
         info: BeliefInfo,
@@ -121,6 +124,7 @@ pub enum Reply {
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeaseInfo {
+    /// The lease's number, which each step request contains.
     pub lease: u64,
     /// Time from the last use of the lease until it ends.
     pub ttl_millis: u64,

@@ -4,6 +4,7 @@ use super::codes::Status;
 use emberwatch_model::text::parse_problem;
 use serde::de::DeserializeOwned;
 
+/// Maximum size of a control message in bytes: 1 MiB.
 pub const MAX_CONTROL_BYTES: usize = 1 << 20;
 
 /// Maximum length of the reason in a refusal, in characters: it may quote a long word of the request.

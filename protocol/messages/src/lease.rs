@@ -87,6 +87,7 @@ impl<'a> Call<'a> {
         Self { steps, ..call }
     }
 
+    /// Returns the request, without the fields that [`Backend::step`] fills in.
     pub fn request(&self) -> &StepRequest {
         &self.request
     }

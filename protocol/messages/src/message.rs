@@ -108,11 +108,13 @@ pub struct StepReply {
     pub status: u32,
     /// The request's sequence number.
     pub sequence: u64,
+    /// Number of the first robot, from the request.
     pub first_robot: u32,
     /// Number of robots in the payload; 0 unless the status is `Ok`.
     pub n_robots: u32,
     /// Number of worlds of these robots; 0 unless the status is `Ok`.
     pub n_worlds: u32,
+    /// The request's flags.
     pub flags: u32,
     /// Grid height H.
     pub height: u32,

@@ -11,8 +11,10 @@ use emberwatch_model::frame::UNOBSERVED;
 use emberwatch_model::grid::{Grid, Shape};
 use emberwatch_model::path::MAX_MOVES;
 
+/// Size of one [`WorldResult`] in a payload in bytes.
 pub const WORLD_BYTES: usize = size_of::<WorldResult>();
 
+/// Size of one [`RobotResult`] in a payload in bytes.
 pub const ROBOT_BYTES: usize = size_of::<RobotResult>();
 
 #[derive(Debug, Clone, PartialEq)]

@@ -142,6 +142,7 @@ impl Airspace {
         }
     }
 
+    /// Returns the cells that the sensor sees from the visited cells (see [`Self::see_into`]).
     pub fn see(&self, visited: &[usize]) -> Vec<usize> {
         let mut seen = Vec::new();
         self.see_into(visited, &mut seen, &mut Vec::new());

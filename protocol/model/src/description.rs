@@ -12,11 +12,15 @@ pub struct Description {
     pub name: String,
     /// Duration of one step, as text for display.
     pub step: String,
+    /// No-fly map with 1 for each cell closed to robots, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub no_fly: Option<CellMap>,
+    /// The sensor, as in a [`ModelFile`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<SensorEntry>,
+    /// The states, in the order of their values.
     pub states: Vec<DescribedState>,
+    /// The observations, in the order of their values.
     pub observations: Vec<ObservationEntry>,
 }
 
@@ -25,9 +29,11 @@ pub struct Description {
 #[serde(deny_unknown_fields)]
 pub struct DescribedState {
     pub name: String,
+    /// Colour in pictures, `#rrggbb`.
     pub color: String,
     #[serde(default)]
     pub reward: f64,
+    /// `P(y | this state)`, one entry per observation (eq. 1).
     pub observed_as: Vec<f64>,
 }
 

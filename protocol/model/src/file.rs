@@ -9,16 +9,20 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use thiserror::Error;
 
+/// Maximum number of states, and of observations: 64.
 pub const MAX_VALUES: usize = 64;
 
+/// Maximum side of a kernel: 15 cells.
 pub const MAX_KERNEL_SIDE: usize = 15;
 
 /// Minimum sum of a cell's weights, relative to the largest weight. The smallest normal `f32` is 1e-38, so larger sums
 /// keep their precision.
 pub(super) const LEAST_SHARE: f64 = 1e-30;
 
+/// Minimum probability of a transition that is not 0: 1e-9.
 pub const MIN_PROBABILITY: f64 = 1e-9;
 
+/// Maximum radius of a sensor: 8 cells.
 pub const MAX_RADIUS: usize = 8;
 
 /// A model as written in TOML; [`super::Model::new`] checks it.
@@ -131,6 +135,7 @@ pub struct TransitionEntry {
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ModelError {
+    /// The text is not TOML, or lacks the structure of a model file.
     #[error("model file: {0}")]
     Toml(String),
     #[error(
@@ -154,6 +159,7 @@ pub enum ModelError {
         what: &'static str,
         name: String,
     },
+    /// A file cannot be read.
     #[error("{}: {problem}", shortened(path))]
     File { path: String, problem: String },
     #[error(

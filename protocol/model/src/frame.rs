@@ -29,6 +29,7 @@ pub struct Frame {
     values: Grid<u8>,
 }
 
+/// The error for bytes that are not a frame of the expected grid.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum FrameError {
     #[error("frame: expected {expected} bytes for a {shape} grid, got {got}")]

@@ -33,6 +33,7 @@ pub struct Cell {
     pub col: usize,
 }
 
+/// The error for a height or width outside `1..=MAX_SIDE`.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("grid shape: expected height and width in 1..={MAX_SIDE}, got {height} x {width}")]
 pub struct ShapeError {

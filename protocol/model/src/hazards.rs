@@ -54,6 +54,7 @@ impl Hazards {
         self.size
     }
 
+    /// Returns the transitions of cells in a state, in order.
     pub fn transitions(&self, from: usize) -> &[Transition] {
         &self.transitions[from]
     }
@@ -80,12 +81,14 @@ impl Hazards {
         &self.maps
     }
 
+    /// Returns the grid of the maps, if there are maps.
     pub fn shape(&self) -> Option<Shape> {
         self.shape
     }
 }
 
 impl Factors {
+    /// Returns whether all factors are 1.
     pub fn are_one(&self) -> bool {
         self.of_cells.is_none() && self.of_neighbours.is_none()
     }

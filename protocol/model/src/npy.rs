@@ -11,7 +11,9 @@ const MAX_HEADER_BYTES: u16 = 512;
 
 pub(super) struct Npy<'b> {
     bytes: &'b [u8],
+    /// The shape that the header states.
     pub shape: Vec<usize>,
+    /// Number of bytes after the header.
     pub n_bytes: usize,
 }
 

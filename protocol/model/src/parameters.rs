@@ -23,6 +23,7 @@ pub enum Rule {
     Hazards(Arc<Hazards>),
 }
 
+/// The parameters of eq. 2.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ratio {
     kernel: Array4<f64>,

@@ -27,9 +27,11 @@ pub struct Flight {
     /// Row-major indices of the distinct cells flown over, in the order of the first visit. The start cell is among
     /// them only if the path returns to it, or if a move off the grid or into a no-fly cell leaves the robot there.
     pub visited: Vec<usize>,
+    /// The robot's last cell.
     pub end: Cell,
 }
 
+/// The error for a byte that is not a move.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("move {index} of the path: expected 0 (up), 1 (down), 2 (left) or 3 (right), got {value}")]
 pub struct MoveError {

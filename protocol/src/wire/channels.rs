@@ -29,8 +29,10 @@ pub use emberwatch_messages::capacity::{
 pub use emberwatch_messages::errors::ChannelError;
 pub use emberwatch_messages::instance::Instance;
 
+/// Maximum number of observers of `frames` at a time.
 pub const MAX_OBSERVERS: usize = 16;
 
+/// Maximum number of readers of `truth` at a time.
 pub const MAX_TRUTH_READERS: usize = 4;
 
 /// Number of frames that an observer may be behind before it loses the oldest.
@@ -40,6 +42,7 @@ pub const FRAME_BUFFER: usize = 64;
 /// be published at once without loss.
 pub const TRUTH_BUFFER: usize = 128;
 
+/// Maximum number of readers of `agent` at a time.
 pub const MAX_AGENT_READERS: usize = 4;
 
 /// Number of beliefs that a reader may be behind before it loses the oldest. A display needs only the newest.

@@ -29,6 +29,7 @@ const MAX_KNOWN_LISTENERS: usize = 1024;
 /// Maximum time that an ending sender waits for clients to read its last answers.
 const LAST_ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
+/// A request that is waiting for its answer.
 pub type Active<Q, R> = ActiveRequest<Ipc, [u8], WireHeader<Q>, [u8], WireHeader<R>>;
 
 pub type ActiveControl = Active<ControlRequest, ControlReply>;

@@ -22,6 +22,7 @@ impl Simulator {
         deadlines.min()
     }
 
+    /// Withdraws a step request whose client has stopped waiting for the answer.
     pub fn cancel_step(&mut self, now: Instant, ticket: Ticket) {
         for &world in &self.waiting_worlds {
             let barrier = &mut self.places[world].barrier;

@@ -260,6 +260,7 @@ impl Simulator {
 }
 
 impl Checked {
+    /// Returns the answer to `hello` of a server with these settings.
     pub fn info(&self) -> ServerInfo {
         let (config, file) = (&self.config, self.model.file());
         let recorded = &self.recorded;

@@ -61,6 +61,7 @@ pub struct Claim {
     pub client: ClientId,
     pub robots: Range<usize>,
     pub takeover: bool,
+    /// Time after its last use at which the lease expires.
     pub time_to_live: Duration,
 }
 
@@ -201,6 +202,7 @@ impl Leases {
         self.end_where(|lease| lease.client.pid == pid)
     }
 
+    /// Ends and returns the leases whose client's node is not in `nodes`.
     pub fn end_of_nodes_except(&mut self, nodes: &HashSet<u128>) -> Vec<Lease> {
         self.end_where(|lease| !nodes.contains(&lease.client.node))
     }
@@ -223,6 +225,7 @@ impl Leases {
         bits(holders.map(Option::is_some))
     }
 
+    /// Returns a mask of the robots that a lease holds, in a range of at most 64.
     pub fn held_under(&self, token: u64, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
         bits(holders.map(|holder| *holder == Some(token)))

@@ -14,6 +14,7 @@ use std::collections::{HashSet, VecDeque};
 use std::ops::Range;
 use std::time::Instant;
 
+/// All worlds and leases of a server. It answers requests without I/O and without a clock.
 pub struct Simulator {
     pub(super) checked: Checked,
     pub(super) spec: WorldSpec,

@@ -24,6 +24,7 @@ pub struct WorldOutcome {
     pub is_truncated: bool,
 }
 
+/// The result of a step for a robot, or its position after a reset.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RobotOutcome {
     /// The robot's share of the world's reward: each of v robots that visited a cell gets 1/v of the cell's reward.

@@ -24,6 +24,7 @@ pub struct Rules {
     pub target_state: u8,
     pub n_states: usize,
     pub n_observations: usize,
+    /// Number of steps simulated before k = 0.
     pub burn_in: u64,
     /// Episode length in steps. If it is 0, episodes are never truncated.
     pub max_steps: u64,

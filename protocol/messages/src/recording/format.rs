@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
 use thiserror::Error;
 
+/// The first bytes of every recording.
 pub const MAGIC: [u8; 8] = *b"EMBERREC";
 
 /// Versions of the format that can be read, each the protocol version of the samples. The last one is written. A file
@@ -35,12 +36,14 @@ pub struct FileHeader {
     pub reserved: u32,
 }
 
+/// The header of a record, before its body.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct RecordHeader {
     /// Time in nanoseconds since the recording began; never less than in the previous record.
     pub nanos: u64,
     pub kind: u32,
+    /// Size of the stored body in bytes.
     pub length: u32,
     /// Number of samples of the same channel that the recorder missed directly before this record.
     pub n_lost: u32,
@@ -86,7 +89,9 @@ pub struct Totals {
     pub n_servers: u64,
     pub n_frames: u64,
     pub n_truths: u64,
+    /// Number of frames that the recorder missed.
     pub n_lost_frames: u64,
+    /// Number of hidden states that the recorder missed.
     pub n_lost_truths: u64,
 }
 

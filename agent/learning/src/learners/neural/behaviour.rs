@@ -23,6 +23,7 @@ pub struct Behaviour {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Aim {
     Walk,
+    /// Cells that have not been seen for a long time.
     Cover,
     Far,
     /// Cells in which the observation with the highest reward was seen recently.

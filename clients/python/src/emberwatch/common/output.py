@@ -15,7 +15,9 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-def number(kind: type[float], least: float, most: float) -> Callable[[str], float]:
+def number(
+    kind: type[float], least: float, most: float = math.inf, unit: str = ""
+) -> Callable[[str], float]:
     """Returns a function that parses a flag's number, which must be within `least` to `most`."""
 
     def parse(text: str) -> float:
@@ -24,8 +26,9 @@ def number(kind: type[float], least: float, most: float) -> Callable[[str], floa
         except ValueError:
             value = math.nan
         if not least <= value <= most:
-            sort = "a whole number, " if kind is int else ""
-            raise argparse.ArgumentTypeError(f"expected {sort}{least} to {most}, got {text}")
+            sort = "a whole number" if kind is int else unit or "a number"
+            limits = f"{least} or more" if most == math.inf else f"{least} to {most}"
+            raise argparse.ArgumentTypeError(f"expected {sort}, {limits}, got {text}")
         return value
 
     return parse

@@ -6,7 +6,7 @@ from typing import Final
 from emberwatch.common.output import number
 
 WHOLE: Final = number(int, 1, 999_999_999)
-METRES: Final = number(float, 1e-3, 10**9)
+METRES: Final = number(float, 1e-3, 10**9, "metres")
 
 
 def add_common(parser: ArgumentParser) -> None:

@@ -39,7 +39,7 @@ def parser() -> Parser:
     add("--height-unit", choices=tuple(UNITS), help="unit of the heights [the raster's, or m]")
     add(
         "--wind-speed",
-        type=number(float, 0.0, 100.0),
+        type=number(float, 0, 100, "metres per second"),
         default=0.0,
         metavar="M/S",
         help="speed of the wind [0]",

@@ -36,11 +36,15 @@ _MOST_WIDE_ROWS = 32  # maximum number of rows that fit a terminal with one line
 class Picture:
     """The contents of a picture of one world."""
 
-    frame: NDArray[np.uint8]  # observed values, 255 in unobserved cells, (H, W)
+    frame: NDArray[np.uint8]
+    """Observed values, 255 in unobserved cells, shape (H, W)."""
     palette: Palette
-    robots: Sequence[tuple[int, int]] = ()  # the cell of each robot: row, column
-    paths: Sequence[NDArray[np.intp]] = ()  # the visited cells of each robot that flew, (n, 2)
-    truth: NDArray[np.uint8] | None = None  # the hidden states, (H, W), if known
+    robots: Sequence[tuple[int, int]] = ()
+    """The cell (row, column) of each robot."""
+    paths: Sequence[NDArray[np.intp]] = ()
+    """The visited cells (row, column) of each robot that flew, in order, shape (n, 2)."""
+    truth: NDArray[np.uint8] | None = None
+    """The hidden states, shape (H, W); None if they are unknown."""
     airspace: Airspace = Airspace()  # noqa: RUF009
 
     def color_of(self, robot: int) -> Color | None:
@@ -52,9 +56,9 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
     """Draws a frame with paths and robots, and the hidden states next to it (below on wide grids).
 
     A path is a line, or a tint if cells are smaller than 3 pixels. `scale` is the side of a cell in
-    pixels; None: the longer side of a panel is about 512 pixels. The image has shape (height,
-    width, 3). Its size depends only on the grid, the scale, and whether hidden states are known;
-    both sides are even, as video codecs require.
+    pixels, at least 1; None: the longer side of a panel is about 512 pixels. The image has shape
+    (height, width, 3). Its size depends only on the grid, the scale, and whether hidden states are
+    known; both sides are even, as video codecs require.
     """
     height, width = picture.frame.shape
     if scale is None:  # an even number, unless cells are too small

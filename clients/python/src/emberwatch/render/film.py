@@ -70,13 +70,13 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("recording", type=Path, help="a recording of `emberwatch-server record`")
     add("--out", type=Path, required=True, metavar="FILE", help="a .gif, or with --step a .png")
-    step = number(int, 0, math.inf)
+    step = number(int, 0)
     add("--step", type=step, metavar="K", help="make a still of this step")
     add("--from", dest="first", type=step, default=0, metavar="K", help="first step to show [0]")
     add("--to", dest="last", type=step, default=math.inf, metavar="K", help="last step [the last]")
     add(
         "--every",
-        type=number(int, 1, math.inf),
+        type=number(int, 1),
         default=1,
         metavar="N",
         help="show every N-th step [1]",
