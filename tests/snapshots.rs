@@ -106,11 +106,15 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
     send_paths(&mut server.acquire(0..1), Paths::new(1).next(N_MOVES));
     server.command(&format!("snapshot {file}")).check(0);
     let (whole, before) = (folder.bytes("lab.snapshot"), server.observe(0));
-    let mut damaged = whole.clone();
-    damaged[whole.len() / 2] ^= 1;
-    let path = folder.write("other", damaged);
-    let words = "damaged: expected the checksum";
-    refused(&server, &format!("restore {path} --takeover"), words);
+    for (at, words) in [
+        (whole.len() / 2, "damaged: expected the checksum"),
+        (8, "expected a snapshot of version 2, got version 3"),
+    ] {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 1;
+        let path = folder.write("other", damaged);
+        refused(&server, &format!("restore {path} --takeover"), words);
+    }
     assert_eq!(server.observe(0), before);
     for (path, words) in [
         ("/no/such/file", "snapshot file /no/such/file"),

@@ -41,7 +41,10 @@ fn hello_status_and_snapshots_name_the_task() {
 fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
     let folder = Folder::default();
     let text = mine("team").replace("end = 32", "end = 2");
-    let task = folder.write("own.toml", text.replace("max_steps = 300", "max_steps = 3"));
+    let task = folder.write(
+        "own.toml",
+        text.replace("max_steps = 300", "max_steps = 1501"),
+    );
     let csv = folder.word("rows.csv");
     let policies = "--policies coverage --baseline coverage";
     agent(&format!("compare --task {task} {policies} --csv {csv}"));
@@ -49,7 +52,7 @@ fn commands_of_the_agent_take_worlds_steps_and_seeds_of_a_task() {
     let runs = runs
         .iter()
         .map(|run| (run.world_seed, run.steps, run.robots));
-    assert_eq!(Vec::from_iter(runs), [(0, 3, 4), (1, 3, 4)]);
+    assert_eq!(Vec::from_iter(runs), [(0, 1501, 4), (1, 1501, 4)]);
     let out = folder.word("learned");
     agent(&format!(
         "train --task {task} --worlds 2 --steps 8 --out {out}"

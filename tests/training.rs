@@ -437,7 +437,8 @@ fn an_autoencoder_learns_in_one_world_whose_episodes_end() {
     let steps = rows[30..].iter().map(|row| &*row[WORLD_STEPS]);
     assert_eq!(Vec::from_iter(steps), ["31", "32", "33"]);
     place.0.write("out/metrics.csv", "update,loss\n");
-    let words = "metrics.csv: expected the columns update,world_steps | got update,loss";
+    let words = "metrics.csv: expected the columns update,world_steps,loss,held_out_log_likelihood,\
+                 mean_reward,rate, | got update,loss";
     place.refuse("out", &learn(&server, "--steps 5 --resume"), words);
     // Here a window of frames covers a whole episode.
     let whole = Server::start(&format!("{WORLD} --coverage client --max-steps 3"));

@@ -235,16 +235,19 @@ pub fn python() -> PathBuf {
 }
 
 /// Returns the path of a program, which `cargo build --workspace` makes in the folder above the tests.
+/// Returns the path of a program of this workspace, built from the sources as they are now.
 pub fn program_path(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("this program's path");
-    let path = test
-        .ancestors()
-        .nth(2)
-        .expect("target/<profile>/deps/test")
-        .join(name);
+    let target = test.ancestors().nth(2).expect("target/<profile>/deps/test");
+    let path = target.join(name);
+    let changed = |path: &Path| path.metadata().and_then(|data| data.modified()).ok();
+    // Cargo lists the sources of a program beside it: `PROGRAM: SOURCE SOURCE ...`.
+    let sources = std::fs::read_to_string(path.with_extension("d")).unwrap_or_default();
+    let newest = sources.split_whitespace().skip(1).map(Path::new);
+    let newest = newest.filter_map(changed).max();
     assert!(
-        path.exists(),
-        "no {name}: run `cargo build --workspace` before the tests"
+        newest.is_some() && changed(&path) >= newest,
+        "{name} is missing or older than a source: run `cargo build --workspace` before the tests"
     );
     path
 }
