@@ -246,7 +246,7 @@ def test_worlds_without_rewards_cause_a_warning(tmp_path: Path) -> None:
     model = tmp_path / "model.toml"
     model.write_text(Path(LIVELY).read_text().replace("reward = 1.0", "reward = 0.0"))
     for making in (gymnasium.make, gymnasium.make_vec):
-        with pytest.warns(UserWarning, match="no state pays: every reward will be 0") as caught:
+        with pytest.warns(UserWarning, match="model .lively.: no state pays") as caught:
             making(WILDFIRE, **SMALL | {"model": str(model)})
         assert caught[0].filename == __file__
     # A world in which nothing burns causes one warning.

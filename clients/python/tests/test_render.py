@@ -97,6 +97,7 @@ def test_grey_and_path_differ_from_the_models_colours() -> None:
     dark = Model.from_toml(re.sub(r"#\w{6}\"", '#202028"', toml))
     assert Palette.of(dark).unobserved == (0x60,) * 3
     assert Palette.of(dark).path == WHITE
+    assert mark_on(np.array([NORMAL, LATENT], np.uint8)).tolist() == [list(WHITE), list(DARK)]
     # A hidden model has colours, too.
     palette = Palette.of(3)
     assert palette.observations == WILDFIRE.observations
