@@ -241,7 +241,7 @@ pub fn program_path(name: &str) -> PathBuf {
     let target = test.ancestors().nth(2).expect("target/<profile>/deps/test");
     let path = target.join(name);
     let changed = |path: &Path| path.metadata().and_then(|data| data.modified()).ok();
-    // Cargo lists the sources of a program beside it: `PROGRAM: SOURCE SOURCE ...`.
+    // Cargo lists the sources of a program in a file next to it: `PROGRAM: SOURCE SOURCE ...`.
     let sources = std::fs::read_to_string(path.with_extension("d")).unwrap_or_default();
     let newest = sources.split_whitespace().skip(1).map(Path::new);
     let newest = newest.filter_map(changed).max();
