@@ -234,8 +234,8 @@ pub fn python() -> PathBuf {
     python
 }
 
-/// Returns the path of a program, which `cargo build --workspace` makes in the folder above the tests.
-/// Returns the path of a program of this workspace, built from the sources as they are now.
+/// Returns the path of a program, which `cargo build --workspace` makes in the folder above the tests. Fails if a source
+/// of the program is newer.
 pub fn program_path(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("this program's path");
     let target = test.ancestors().nth(2).expect("target/<profile>/deps/test");
@@ -246,7 +246,7 @@ pub fn program_path(name: &str) -> PathBuf {
     let newest = sources.split_whitespace().skip(1).map(Path::new);
     let newest = newest.filter_map(changed).max();
     assert!(
-        newest.is_some() && changed(&path) >= newest,
+        path.exists() && changed(&path) >= newest,
         "{name} is missing or older than a source: run `cargo build --workspace` before the tests"
     );
     path

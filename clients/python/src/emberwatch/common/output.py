@@ -18,7 +18,10 @@ class Parser(argparse.ArgumentParser):
 def number(
     kind: type[float], least: float, most: float = math.inf, unit: str = ""
 ) -> Callable[[str], float]:
-    """Returns a function that parses a flag's number, which must be within `least` to `most`."""
+    """Returns a function that parses a flag's number, which must be within `least` to `most`.
+
+    Its error names the `unit`.
+    """
 
     def parse(text: str) -> float:
         try:
